@@ -1,0 +1,1 @@
+"""Co-simulation: exact time, ports, systems, master, records, checkpoints. Knows no navigation."""

@@ -1,0 +1,443 @@
+"""What stands behind ports while a simulation runs: slots, and the views components see.
+
+A *slot* holds what an output published, ensemble axis first. A reader is a view of a slot: the
+slot's own memory where nothing has to be converted, latched or delayed, else a private copy that
+a `links.Transfer` fills.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from terrafix.cosim.errors import CheckpointError
+from terrafix.cosim.ports import Field, Port
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Saved = dict[str, Any]
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+class SignalSlot:
+    """Memory of one signal: a flat row per member, and a shaped view for each field.
+
+    Attributes
+    ----------
+    data : ndarray, shape (n_members, width)
+        All fields side by side (of the field's dtype if the port has one field).
+    views : dict of str to ndarray, shape (n_members, *shape)
+        Writable windows into `data`.
+    """
+
+    def __init__(self, fields: Mapping[str, Field], n_members: int) -> None:
+        dtype = np.dtype(next(iter(fields.values())).dtype)
+        width = sum(f.size for f in fields.values())
+        empty = np.nan if dtype.kind in "fc" else 0
+        self.data: NDArray[Any] = np.full((n_members, width), empty, dtype=dtype)
+        self.views: dict[str, NDArray[Any]] = {}
+        start = 0
+        for name, each in fields.items():
+            columns = self.data[:, start : start + each.size]
+            self.views[name] = _strided(columns, each.fixed_shape)
+            start += each.size
+
+    def get_state(self) -> Saved:
+        """Arrays that reproduce the slot."""
+        return {"data": self.data.copy()}
+
+    def set_state(self, saved: Saved) -> None:
+        """Put back what `get_state` gave."""
+        _restore(self.data, saved["data"])
+
+
+def _strided(columns: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """View part of each row as an array of `shape`, without a copy."""
+    strides, step = [], columns.itemsize
+    for extent in reversed(shape):
+        strides.append(step)
+        step *= extent
+    return np.lib.stride_tricks.as_strided(
+        columns, (columns.shape[0], *shape), (columns.strides[0], *reversed(strides))
+    )
+
+
+def _restore(target: NDArray[Any], source: NDArray[Any]) -> None:
+    if target.shape != np.shape(source):
+        raise CheckpointError(f"saved array has shape {np.shape(source)}, expected {target.shape}")
+    target[...] = source
+
+
+class BundleView:
+    """Fields of a bundle by name; assigning copies into the published array."""
+
+    def __init__(self, views: Mapping[str, NDArray[Any]], *, writable: bool) -> None:
+        for name, array in views.items():
+            self.__dict__[name] = array if writable else _read_only(array)
+        self.__dict__["_writable"] = writable
+
+    def __getattr__(self, name: str) -> FloatArray:
+        fields = [k for k in self.__dict__ if not k.startswith("_")]
+        raise AttributeError(f"there is no field '{name}'; the fields are {fields}")
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not self.__dict__["_writable"]:
+            raise AttributeError(
+                f"field '{name}' is an input: components do not write their inputs"
+            )
+        getattr(self, name)[...] = value
+
+
+class MessageSlot(SignalSlot):
+    """Memory of one message: the latest valid value of each member, with its time and number.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n_members,)
+        Time of validity [s]; NaN before the first message.
+    sequence : ndarray of int64, shape (n_members,)
+        Number of messages published so far to each member.
+    count : ndarray of int64, shape (n_members,)
+        Used length of the first axis of a ragged message.
+    version : int
+        Grows with every publication that reached any member.
+    """
+
+    def __init__(self, fields: Mapping[str, Field], n_members: int) -> None:
+        super().__init__(fields, n_members)
+        self.t = np.full(n_members, np.nan)
+        self.sequence = np.zeros(n_members, dtype=np.int64)
+        self.count = np.zeros(n_members, dtype=np.int64)
+        self.version = 0
+
+    def copy_from(self, other: MessageSlot, factor: FloatArray | None = None) -> None:
+        """Take over value, time and sequence of another slot, converted by `factor`."""
+        if factor is None:
+            self.data[...] = other.data
+        else:
+            np.multiply(other.data, factor, out=self.data)
+        self.t[...] = other.t
+        self.sequence[...] = other.sequence
+        self.count[...] = other.count
+        self.version = other.version
+
+    def get_state(self) -> Saved:
+        """Arrays that reproduce the slot."""
+        return super().get_state() | {
+            "t": self.t.copy(),
+            "sequence": self.sequence.copy(),
+            "count": self.count.copy(),
+            "version": self.version,
+        }
+
+    def set_state(self, saved: Saved) -> None:
+        """Put back what `get_state` gave."""
+        super().set_state(saved)
+        _restore(self.t, saved["t"])
+        _restore(self.sequence, saved["sequence"])
+        _restore(self.count, saved["count"])
+        self.version = int(saved["version"])
+
+
+class MessageWriter:
+    """What a component publishes messages with.
+
+    Attributes
+    ----------
+    slot : MessageSlot
+    draft : dict of str to ndarray
+        Arrays a kernel may fill before `publish_draft`; consumers do not see them.
+    """
+
+    def __init__(self, port: Port[Any], n_members: int, active: Mask) -> None:
+        self.slot = MessageSlot(port.fields, n_members)
+        self._ragged = any(f.ragged for f in port.fields.values())
+        self._name = port.name
+        self._active = active
+        self._draft: MessageSlot | None = None
+        self._fields = dict(port.fields)
+
+    @property
+    def draft(self) -> dict[str, NDArray[Any]]:
+        """Scratch arrays of every field, shape (n_members, *shape)."""
+        if self._draft is None:
+            self._draft = MessageSlot(self._fields, len(self.slot.t))
+        return self._draft.views
+
+    def publish_draft(self, t: float, valid: Mask) -> None:
+        """Publish what stands in `draft` to the members in `valid`."""
+        assert self._draft is not None
+        self._commit(t, valid & self._active, self._draft.data)
+
+    def publish(
+        self,
+        t: float | FloatArray,
+        value: object = None,
+        *,
+        valid: Mask | None = None,
+        count: object = None,
+        **fields: object,
+    ) -> None:
+        """Publish a message.
+
+        Parameters
+        ----------
+        t : float or ndarray, shape (n_members,)
+            Time of validity [s].
+        value : array_like, shape (n_members, *shape)
+            Of a message with one field.
+        valid : ndarray of bool, shape (n_members,), optional
+            Members that receive it; all if absent.
+        count : array_like of int, optional
+            Used length of a ragged message.
+        **fields : array_like
+            Of a message with named fields; all must be given.
+        """
+        mask = self._active if valid is None else (valid & self._active)
+        draft = self.draft
+        given = {"": value} if "" in draft else fields
+        missing = set(draft) - {k for k, v in given.items() if v is not None}
+        extra = set(given) - set(draft)
+        if missing or extra:
+            raise ValueError(
+                f"message '{self._name}' has fields {sorted(draft)}; "
+                f"missing {sorted(missing)}, unknown {sorted(extra)}"
+            )
+        for name, each in given.items():
+            draft[name][...] = each
+        if self._ragged:
+            if count is None:
+                raise ValueError(f"message '{self._name}' is ragged; give its count")
+            np.copyto(self.slot.count, np.asarray(count, dtype=np.int64), where=mask)
+        assert self._draft is not None
+        self._commit(t, mask, self._draft.data)
+
+    def _commit(self, t: float | FloatArray, mask: Mask, data: NDArray[Any]) -> None:
+        if not mask.any():
+            return
+        slot = self.slot
+        np.copyto(slot.data, data, where=mask[:, None])
+        np.copyto(slot.t, t, where=mask)
+        slot.sequence += mask
+        slot.version += 1
+
+
+class MessageReader:
+    """What a component sees of a message.
+
+    Attributes
+    ----------
+    fresh : ndarray of bool, shape (n_members,)
+        A message came since this component's last step.
+    t : ndarray, shape (n_members,)
+        Time of validity [s].
+    sequence : ndarray of int64, shape (n_members,)
+        Number of the message; a changed number is a new message.
+    count : ndarray of int64, shape (n_members,)
+        Used length of a ragged message.
+    value : ndarray, shape (n_members, *shape)
+        Of a message with one field; named fields are attributes.
+    overruns : int
+        Messages lost, over all members, because they were replaced before they were read.
+    queued : list of dict
+        With a queue deeper than one: the unread messages, oldest first, each with ``t``,
+        ``valid`` (n_members,) and its fields.
+    """
+
+    def __init__(self, port: Port[Any], slot: MessageSlot) -> None:
+        self._name = port.name
+        self.depth = port.queue
+        self.slot = slot
+        self.fresh: Mask = np.zeros(len(slot.t), dtype=np.bool_)
+        self.fresh_number = np.zeros(len(slot.t))  # the same for kernels: 0.0 or 1.0
+        self.overruns = 0
+        self._seen = np.zeros(len(slot.t), dtype=np.int64)
+        self._version = 0
+        self._collected = 0
+        self._any_fresh = False
+        self._waiting: list[Saved] = []
+        self.queued: list[Saved] = []
+        self._fields = {name: _read_only(view) for name, view in slot.views.items()}
+        self.t = _read_only(slot.t)
+        self.sequence = _read_only(slot.sequence)
+        self.count = _read_only(slot.count)
+
+    @property
+    def value(self) -> NDArray[Any]:
+        """The value of a message with a single field."""
+        return self._fields[""]
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        fields = self.__dict__.get("_fields", {})
+        if name in fields:
+            view: NDArray[Any] = fields[name]
+            return view
+        raise AttributeError(f"there is no field '{name}'; the fields are {sorted(fields)}")
+
+    def collect(self) -> None:
+        """Keep a copy of what was just published (queues deeper than one)."""
+        slot = self.slot
+        if slot.version == self._collected:
+            return
+        self._collected = slot.version
+        valid = slot.sequence > self._seen
+        for earlier in self._waiting:
+            valid &= slot.sequence > earlier["sequence"]
+        record: Saved = {"valid": valid, "t": slot.t.copy(), "sequence": slot.sequence.copy()}
+        record |= {name or "value": view.copy() for name, view in slot.views.items()}
+        record["count"] = slot.count.copy()
+        self._waiting.append(record)
+        if len(self._waiting) > self.depth:
+            self.overruns += int(self._waiting.pop(0)["valid"].sum())
+
+    def refresh(self) -> None:
+        """Before the component steps: find out what is new."""
+        slot = self.slot
+        if slot.version == self._version:
+            if self._any_fresh:
+                self.fresh[:] = False
+                self.fresh_number[:] = 0.0
+                self.queued = []
+                self._any_fresh = False
+            return
+        np.greater(slot.sequence, self._seen, out=self.fresh)
+        self.fresh_number[:] = self.fresh
+        if self.depth == 1:
+            unread = slot.sequence - self._seen - 1
+            self.overruns += int(unread[unread > 0].sum())
+        else:
+            self.queued, self._waiting = self._waiting, []
+        self._seen[:] = slot.sequence
+        self._version = slot.version
+        self._any_fresh = True
+
+    def get_state(self) -> Saved:
+        """Arrays that reproduce the reader."""
+        return {
+            "fresh": self.fresh.copy(),
+            "seen": self._seen.copy(),
+            "version": self._version,
+            "collected": self._collected,
+            "overruns": self.overruns,
+            "waiting": [dict(record) for record in self._waiting],
+        }
+
+    def set_state(self, saved: Saved) -> None:
+        """Put back what `get_state` gave."""
+        _restore(self.fresh, saved["fresh"])
+        self.fresh_number[:] = self.fresh
+        self._any_fresh = bool(self.fresh.any())
+        _restore(self._seen, saved["seen"])
+        self._version = int(saved["version"])
+        self._collected = int(saved["collected"])
+        self.overruns = int(saved["overruns"])
+        self._waiting = [dict(record) for record in saved["waiting"]]
+
+
+class WindowView:
+    """All samples of a signal since the consumer's last step.
+
+    Attributes
+    ----------
+    samples : ndarray, shape (n_members, n_samples, *shape)
+    times : ndarray, shape (n_samples,)
+        When each was published [s].
+    """
+
+    def __init__(self, source: NDArray[Any], capacity: int, factor: FloatArray | None) -> None:
+        self._source = source
+        self._factor = None if factor is None else factor.reshape(source.shape[1:])
+        n_members = source.shape[0]
+        self._values: NDArray[Any] = np.empty(
+            (n_members, capacity, *source.shape[1:]), dtype=source.dtype
+        )
+        self._times = np.empty(capacity)
+        self.n_samples = 0
+
+    @property
+    def samples(self) -> NDArray[Any]:
+        """The samples, oldest first."""
+        return self._values[:, : self.n_samples]
+
+    @property
+    def times(self) -> FloatArray:
+        """The time of each sample [s]."""
+        return self._times[: self.n_samples]
+
+    def collect(self, t: float) -> None:
+        """Append what the source holds now."""
+        if self.n_samples == len(self._times):
+            self._grow()
+        self._values[:, self.n_samples] = self._source
+        if self._factor is not None:
+            self._values[:, self.n_samples] *= self._factor
+        self._times[self.n_samples] = t
+        self.n_samples += 1
+
+    def _grow(self) -> None:
+        values = np.empty_like(
+            self._values,
+            shape=(self._values.shape[0], 2 * len(self._times), *self._values.shape[2:]),
+        )
+        values[:, : self.n_samples] = self._values
+        self._values = values
+        self._times = np.concatenate([self._times, np.empty_like(self._times)])
+
+    def clear(self) -> None:
+        """Forget the samples once the consumer has stepped."""
+        self.n_samples = 0
+
+    def get_state(self) -> Saved:
+        """Arrays that reproduce the window."""
+        return {"samples": self.samples.copy(), "times": self.times.copy()}
+
+    def set_state(self, saved: Saved) -> None:
+        """Put back what `get_state` gave."""
+        while len(self._times) < len(saved["times"]):
+            self._grow()
+        self.n_samples = len(saved["times"])
+        self._values[:, : self.n_samples] = saved["samples"]
+        self._times[: self.n_samples] = saved["times"]
+
+
+class SharedSlot:
+    """One value for all members; readers hold the slot and see what was put last."""
+
+    def __init__(self, field: Field, name: str, *, value: Any = None) -> None:
+        self._field = field
+        self._name = name
+        self.value = value
+        self.version = 0
+
+    def put(self, value: Any) -> None:
+        """Publish an array by reference, after checking its shape and type."""
+        array = np.asarray(value)
+        expected = self._field.shape
+        matches = len(expected) == array.ndim and all(
+            e is None or e == n for e, n in zip(expected, array.shape, strict=True)
+        )
+        if not matches or array.dtype != np.dtype(self._field.dtype):
+            raise ValueError(
+                f"shared port '{self._name}' takes shape {expected} of "
+                f"{np.dtype(self._field.dtype)}, got {array.shape} of {array.dtype}"
+            )
+        self.value = _read_only(array)
+        self.version += 1
+
+    def get_state(self) -> Saved:
+        """Arrays that reproduce the slot."""
+        value = self.value
+        return {"version": self.version} | ({} if value is None else {"value": np.array(value)})
+
+    def set_state(self, saved: Saved) -> None:
+        """Put back what `get_state` gave; what initialization published again is kept."""
+        if int(saved["version"]) != self.version and "value" in saved:
+            self.put(saved["value"])
+        self.version = int(saved["version"])

@@ -1,0 +1,245 @@
+"""From a checked system to arrays: bind components, make slots, tie every input to its source."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from terrafix.cosim.buffers import (
+    BundleView,
+    MessageReader,
+    MessageSlot,
+    MessageWriter,
+    SharedSlot,
+    SignalSlot,
+    WindowView,
+    _read_only,
+)
+from terrafix.cosim.check import Plan
+from terrafix.cosim.clock import Rate
+from terrafix.cosim.component import Component, Environment
+from terrafix.cosim.links import CopyMessage, CopySignal, DelayLine, Transfer, default_slot
+from terrafix.cosim.ports import Port
+from terrafix.cosim.system import Connection
+from terrafix.cosim.wiring import port_factor
+
+Slot = SignalSlot | SharedSlot
+
+
+@dataclass
+class Wiring:
+    """Everything between components while a simulation runs.
+
+    Attributes
+    ----------
+    slots : dict of str to slot
+        What each output published, by port path.
+    before, latch, after : dict of str to list of callables
+        By consumer path: transfers before it steps, and at the end of a tick in which it
+        stepped; by producer path: what collects a value it has just published.
+    clear : dict of str to list of callables
+        By consumer path: windows to empty once it has stepped.
+    keepers : dict of str to object
+        Everything with `get_state`/`set_state`, by a stable name: part of checkpoints.
+    """
+
+    slots: dict[str, Slot] = field(default_factory=dict)
+    before: dict[str, list[Transfer]] = field(default_factory=lambda: defaultdict(list))
+    latch: dict[str, list[Transfer]] = field(default_factory=lambda: defaultdict(list))
+    after: dict[str, list[Callable[[int, float], None]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    clear: dict[str, list[Callable[[], None]]] = field(default_factory=lambda: defaultdict(list))
+    keepers: dict[str, Any] = field(default_factory=dict)
+    readers: dict[str, MessageReader] = field(default_factory=dict)
+
+
+def bind_components(
+    plan: Plan,
+    *,
+    seed: int,
+    members: NDArray[np.int64],
+    active: NDArray[np.bool_],
+    fail: Callable[[str, NDArray[np.bool_], str], None],
+) -> None:
+    """Lend every component its environment and arrays."""
+    for path, component in plan.flat.components.items():
+
+        def report(mask: NDArray[np.bool_], reason: str, path: str = path) -> None:
+            fail(path, mask, reason)
+
+        component.bind(Environment(path, seed, members, active, report))
+
+
+def connect_ports(plan: Plan, n_members: int, active: NDArray[np.bool_]) -> Wiring:
+    """Make slots for all outputs and views for all inputs."""
+    wiring = Wiring()
+    components = plan.flat.components
+    for path, component in components.items():
+        for name, port in component.outputs().items():
+            slot = _output(component, name, port, n_members, active)
+            wiring.slots[f"{path}.{name}"] = wiring.keepers[f"slot:{path}.{name}"] = slot
+    driven = {c.target: c for c in plan.flat.connections}
+    place = {path: i for i, path in enumerate(plan.order)}
+    for path, component in components.items():
+        for name, port in component.inputs().items():
+            connection = driven.get(f"{path}.{name}")
+            if connection is None:
+                _unconnected(component, name, port, n_members)
+            else:
+                _connect(plan, wiring, place, connection, component, name, port)
+    return wiring
+
+
+def _output(
+    component: Component, name: str, port: Port[Any], n_members: int, active: NDArray[np.bool_]
+) -> Slot:
+    if port.kind == "shared":
+        shared = SharedSlot(port.single, name)
+        component._views[name] = shared
+        return shared
+    if port.kind == "message":
+        writer = MessageWriter(port, n_members, active)
+        component._views[name] = writer
+        return writer.slot
+    slot = SignalSlot(port.fields, n_members)
+    component._views[name] = (
+        BundleView(slot.views, writable=True) if port.is_bundle else slot.views[""]
+    )
+    return slot
+
+
+def _unconnected(component: Component, name: str, port: Port[Any], n_members: int) -> None:
+    view: Any
+    if port.kind == "shared":
+        view = SharedSlot(port.single, name, value=port.default)
+    elif port.kind == "message":
+        view = MessageReader(port, MessageSlot(port.fields, n_members))
+    else:
+        default = 0.0 if port.default is None else port.default
+        slot = default_slot(port.fields, n_members, default)
+        view = _signal_view(port, slot)
+        if port.window:
+            view = WindowView(slot.views[""], 1, None)
+    component._views[name] = view
+
+
+def _signal_view(port: Port[Any], slot: SignalSlot) -> Any:
+    return BundleView(slot.views, writable=False) if port.is_bundle else _read_only(slot.views[""])
+
+
+def _connect(
+    plan: Plan,
+    wiring: Wiring,
+    place: dict[str, int],
+    connection: Connection,
+    component: Component,
+    name: str,
+    port: Port[Any],
+) -> None:
+    path, source_path = connection.target.rpartition(".")[0], plan.flat.owner(connection.source)
+    slot = wiring.slots[connection.source]
+    if isinstance(slot, SharedSlot):
+        component._views[name] = slot
+        return
+    source_port = plan.flat.port(connection.source)
+    factor = port_factor(source_port, port)
+    source_rate, rate = plan.flat.components[source_path].rate, component.rate
+    assert source_rate is not None
+    assert rate is not None
+    if port.window:
+        capacity = _window_capacity(source_rate, rate)
+        window = WindowView(slot.views[""], capacity, factor)
+        component._views[name] = wiring.keepers[f"window:{connection.target}"] = window
+        wiring.after[source_path].append(lambda tick, t: window.collect(t))  # noqa: ARG005
+        wiring.clear[path].append(window.clear)
+        return
+    in_place = _reads_in_place(place[path], place[source_path], rate, source_rate)
+    if connection.delay:
+        private = type(slot)(source_port.fields, len(slot.data))
+        line = DelayLine(slot, private, factor, int(connection.delay / plan.base))
+        wiring.keepers[f"delay:{connection.target}"] = line
+        wiring.after[source_path].append(lambda tick, t: line.collect(tick))  # noqa: ARG005
+        (wiring.latch if port.at == "start" else wiring.before)[path].append(line)
+        slot = _keep(wiring, connection, private)
+    elif port.at == "start" and not in_place:
+        private = type(slot)(source_port.fields, len(slot.data))
+        wiring.latch[path].append(_copy(slot, private, factor))
+        slot = _keep(wiring, connection, private)
+    elif factor is not None:
+        private = type(slot)(source_port.fields, len(slot.data))
+        wiring.before[path].append(_copy(slot, private, factor))
+        slot = _keep(wiring, connection, private)
+    if isinstance(slot, MessageSlot):
+        reader = MessageReader(port, slot)
+        component._views[name] = wiring.readers[connection.target] = reader
+        wiring.keepers[f"reader:{connection.target}"] = reader
+        wiring.before[path].append(_Refresh(reader))
+        if port.queue > 1:
+            wiring.after[source_path].append(_Collect(reader))
+    else:
+        component._views[name] = _signal_view(port, slot)
+
+
+def _keep(wiring: Wiring, connection: Connection, private: SignalSlot) -> SignalSlot:
+    wiring.keepers[f"copy:{connection.target}"] = private
+    return private
+
+
+def _copy(source: SignalSlot, target: SignalSlot, factor: NDArray[np.float64] | None) -> Transfer:
+    if isinstance(source, MessageSlot) and isinstance(target, MessageSlot):
+        return CopyMessage(source, target, factor)
+    return CopySignal(source, target, factor)
+
+
+class _Refresh:
+    """Tell a reader, before its component steps, to look for what is new."""
+
+    def __init__(self, reader: MessageReader) -> None:
+        self.reader = reader
+
+    def __call__(self, tick: int) -> None:  # noqa: ARG002 - the moment does not matter
+        self.reader.refresh()
+
+
+class _Collect:
+    """Queue a message for a reader when it is published."""
+
+    def __init__(self, reader: MessageReader) -> None:
+        self.reader = reader
+
+    def __call__(self, tick: int, t: float) -> None:  # noqa: ARG002 - the moment does not matter
+        self.reader.collect()
+
+
+def _window_capacity(source: Rate, consumer: Rate) -> int:
+    """Samples expected in a window; it grows if more come."""
+    if source.period is None or consumer.period is None:
+        return 16
+    longest = max(consumer.period, consumer.offset)
+    return math.ceil(longest / source.period) + 1
+
+
+def _reads_in_place(place: int, source_place: int, rate: Rate, source: Rate) -> bool:
+    """Whether a start-read may look at the source's memory when its component steps.
+
+    It may if the source has not stepped since the start of the consumer's step: it steps after
+    the consumer within a tick, and only at ticks at which the consumer steps too.
+    """
+    if place >= source_place or rate.period is None:
+        return False
+
+    def on_grid(time: Fraction) -> bool:
+        return time >= rate.offset and (time - rate.offset) % rate.period == 0  # type: ignore[operator]
+
+    if source.times is not None:
+        return all(on_grid(t) for t in source.times if t)
+    assert source.period is not None
+    first = source.offset or source.period
+    return source.period % rate.period == 0 and on_grid(first)

@@ -1,0 +1,243 @@
+"""Everything that can be wrong with a system, found before anything runs and reported together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+
+from terrafix.cosim.clock import Rate, base_step, text_seconds
+from terrafix.cosim.errors import (
+    ConfigurationError,
+    RateError,
+    SystemCheckError,
+    TerrafixError,
+    WiringError,
+)
+from terrafix.cosim.order import stepping_order
+from terrafix.cosim.ports import Field, Port
+from terrafix.cosim.system import FlatSystem, Record, System
+from terrafix.cosim.units import check_unit, conversion_factor
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A checked system: what the master runs.
+
+    Attributes
+    ----------
+    flat : FlatSystem
+    order : list of str
+        Component paths in stepping order.
+    base : Fraction
+        Base step [s].
+    notes : list of str
+        What is allowed but worth knowing.
+    """
+
+    flat: FlatSystem
+    order: list[str]
+    base: Fraction
+    notes: list[str]
+
+
+def check(system: System) -> Plan:
+    """Check a system whole.
+
+    Raises
+    ------
+    SystemCheckError
+        With every problem found.
+    """
+    problems: list[TerrafixError] = []
+
+    def attempt(action: Callable[[], object]) -> None:
+        try:
+            action()
+        except SystemCheckError as error:
+            problems.extend(error.problems)
+        except TerrafixError as error:
+            problems.append(error)
+
+    try:
+        flat = system.flatten()
+    except TerrafixError as error:
+        raise SystemCheckError(system.name, [error]) from error
+    if not flat.components:
+        problems.append(ConfigurationError("the system has no components"))
+    for path, component in flat.components.items():
+        missing = component.missing_settings()
+        for name in missing:
+            kind = component.settings()[name].kind()
+            problems.append(
+                ConfigurationError(f"'{path}' needs a value for '{name}': it takes {kind}")
+            )
+        if component.rate is None:
+            problems.append(
+                RateError(f'\'{path}\' has no rate\n  give it a period ("0.01 s") or hz ("100 Hz")')
+            )
+        if not missing:
+            attempt(component.validate)
+        for port in component.ports.values():
+            for field in port.fields.values():
+                attempt(lambda f=field: _check_units(f))  # type: ignore[misc]
+    problems.extend(_unconnected(flat))
+    problems.extend(_two_drivers(flat))
+    base = _base(flat)
+    problems.extend(_too_fast(flat, base))
+    for record in flat.records:
+        attempt(lambda r=record: record_rate(flat, r))  # type: ignore[misc]
+    for dispersion in flat.dispersions:
+        attempt(lambda d=dispersion: d.read_spread(flat.components))  # type: ignore[misc]
+    order: list[str] = []
+
+    def find_order() -> None:
+        order.extend(stepping_order(flat))
+
+    attempt(find_order)
+    if problems:
+        raise SystemCheckError(system.name, problems)
+    return Plan(flat, order, base, list(_notes(flat)))
+
+
+def _check_units(field: Field) -> None:
+    for unit in (field.unit,) if isinstance(field.unit, str) else field.unit:
+        check_unit(unit)
+
+
+def _unconnected(flat: FlatSystem) -> Iterator[TerrafixError]:
+    driven = {c.target for c in flat.connections}
+    for path, component in flat.components.items():
+        for name, port in component.inputs().items():
+            if f"{path}.{name}" in driven or port.optional:
+                continue
+            fits = [f"'{p}'" for p in _fitting(flat, port, path)]
+            hint = (
+                f"outputs of the same shape, unit and frame: {', '.join(fits)}"
+                if fits
+                else "no output of the system has its shape, unit and frame"
+            )
+            yield WiringError(
+                f"input '{path}.{name}' is not connected and has no default\n  {hint}"
+            )
+
+
+def _fitting(flat: FlatSystem, port: Port[object], own: str) -> Iterator[str]:
+    for path, component in flat.components.items():
+        if path == own:
+            continue
+        for name, output in component.outputs().items():
+            if (
+                output.kind == port.kind
+                and set(output.fields) == set(port.fields)
+                and all(
+                    output.fields[f].shape == port.fields[f].shape
+                    and output.fields[f].frame == port.fields[f].frame
+                    and output.fields[f].unit == port.fields[f].unit
+                    for f in port.fields
+                )
+            ):
+                yield f"{path}.{name}"
+
+
+def _two_drivers(flat: FlatSystem) -> Iterator[TerrafixError]:
+    drivers: dict[str, str] = {}
+    for connection in flat.connections:
+        if connection.target in drivers:
+            yield WiringError(
+                f"input '{connection.target}' has two drivers\n"
+                f"  '{drivers[connection.target]}' and '{connection.source}': remove one of them"
+            )
+        drivers[connection.target] = connection.source
+
+
+def _rates(flat: FlatSystem) -> list[Rate]:
+    rates = [c.rate for c in flat.components.values() if c.rate is not None]
+    return rates + [r.rate for r in flat.records if r.rate is not None]
+
+
+def _base(flat: FlatSystem) -> Fraction:
+    rates = _rates(flat)
+    numbers = [n for rate in rates for n in rate.exact_numbers]
+    numbers += [c.delay for c in flat.connections]
+    listed = [t for rate in rates for t in rate.times or ()]
+    return base_step(numbers, listed)
+
+
+def _too_fast(flat: FlatSystem, base: Fraction) -> Iterator[TerrafixError]:
+    for path, component in flat.components.items():
+        rate = component.rate
+        if rate is None or rate.times is None:
+            continue
+        for early, late in zip(rate.times, rate.times[1:], strict=False):
+            if late - early < base:
+                yield RateError(
+                    f"'{path}' has the times {text_seconds(early)} s and {text_seconds(late)} s, "
+                    f"closer than the base step of {text_seconds(base)} s\n"
+                    "  leave one out, or give another component a finer period"
+                )
+                break
+
+
+def record_rate(flat: FlatSystem, record: Record) -> Rate:
+    """Rate of a recorder: its own, or that of the one component it watches.
+
+    Raises
+    ------
+    WiringError
+        If a port does not exist.
+    RateError
+        If it has no rate of its own and its components do not share one.
+    """
+    owners = []
+    for path in record.ports:
+        port = flat.port(path)
+        if port.is_input:
+            raise WiringError(
+                f"record '{record.name}' names the input '{path}'; record the output that feeds it"
+            )
+        if port.kind == "shared":
+            raise WiringError(f"record '{record.name}' names the shared port '{path}'; it may not")
+        owners.append(flat.owner(path))
+    if record.rate is not None:
+        return record.rate
+    rates = {str(flat.components[o].rate): flat.components[o].rate for o in owners}
+    if len(rates) > 1:
+        raise RateError(
+            f"record '{record.name}' watches components of different rates "
+            f"({', '.join(sorted(rates))})\n  give it a period of its own"
+        )
+    rate = next(iter(rates.values()))
+    if rate is None:
+        raise RateError(f"record '{record.name}' watches a component without a rate")
+    return rate
+
+
+def _notes(flat: FlatSystem) -> Iterator[str]:
+    for record in flat.records:
+        rate = record.rate
+        if rate is None or rate.period is None:
+            continue
+        for path in record.ports:
+            source = flat.components[flat.owner(path)].rate
+            if flat.port(path).kind != "signal" or source is None or source.period is None:
+                continue
+            if (rate.period % source.period) or ((rate.offset - source.offset) % source.period):
+                yield (
+                    f"record '{record.name}' ({rate}) samples '{path}', which is published "
+                    f"{source}: between its steps the last value is held"
+                )
+    for connection in flat.connections:
+        target = flat.port(connection.target)
+        if target.at == "start":
+            yield (
+                f"'{connection.target}' is read at the start of the step: it sees "
+                f"'{connection.source}' of one step earlier"
+            )
+        source_port = flat.port(connection.source)
+        for name, field in source_port.fields.items():
+            unit, other = field.unit, target.fields[name].unit
+            if isinstance(unit, str) and isinstance(other, str) and unit != other:
+                factor = conversion_factor(unit, other)
+                if factor != 1.0:
+                    yield f"'{connection}' is converted from {unit} to {other} (x {factor:g})"

@@ -1,0 +1,229 @@
+"""Exact time: rational periods, integer ticks, schedules.
+
+A period is a rational number of seconds. The base step is the rational greatest common divisor of
+all periods, offsets and delays of a system; time is an integer tick, and seconds come from one
+division, never from a sum.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+
+from terrafix.cosim.errors import RateError
+
+Exact = int | str | Fraction | Decimal
+"""What is accepted as an exact number of seconds or hertz."""
+
+_SECONDS = {"": 1, "s": 1, "ms": Fraction(1, 1000), "us": Fraction(1, 10**6), "min": 60, "h": 3600}
+_HERTZ = {"": 1, "hz": 1, "khz": 1000, "mhz": 10**6}
+_NUMBER = re.compile(
+    r"\s*([+-]?(?:\d+/\d+|(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?))\s*([A-Za-z]*)\s*\Z"
+)
+
+
+def _decimal_hint(value: float) -> str:
+    near = Fraction(value).limit_denominator(100_000)
+    text = f"{value:.12g}"
+    if near.denominator == 1:
+        return f'write {near.numerator} or "{near.numerator}"'
+    return f'write "{text}" (exact) or "{near.numerator}/{near.denominator}"'
+
+
+def _exact(value: object, what: str, units: dict[str, int | Fraction], kind: str) -> Fraction:
+    if isinstance(value, bool):
+        raise RateError(f"{what} is {value}; give {kind}")
+    if isinstance(value, int | Fraction | Decimal):
+        if isinstance(value, Decimal) and not value.is_finite():
+            raise RateError(f"{what} is {value}; give a finite number")
+        return Fraction(value)
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise RateError(f"{what} is {value}; give a finite number")
+        raise RateError(
+            f"{what} is {value!r}, a binary fraction near {value:.12g}\n  {_decimal_hint(value)}"
+        )
+    if isinstance(value, str):
+        match = _NUMBER.match(value)
+        if match and match[2].lower() in units:
+            number = match[1]
+            if number.endswith("/0") or re.search(r"/0+\Z", number):
+                raise RateError(f"{what} is '{value}': division by zero")
+            return Fraction(number) * units[match[2].lower()]
+        accepted = ", ".join(u for u in units if u)
+        raise RateError(
+            f"{what} is '{value}', which is not {kind}\n"
+            f'  write a number such as "8.2", "1/30" or "{"10 ms" if "ms" in units else "100 Hz"}"'
+            f" (units: {accepted})"
+        )
+    raise RateError(f"{what} is {value!r} of type {type(value).__name__}; give {kind} as a string")
+
+
+def seconds(value: object, what: str = "duration") -> Fraction:
+    """Exact seconds from an int, a fraction, a decimal or a string such as ``"8.2 s"``.
+
+    Raises
+    ------
+    RateError
+        If `value` is a float (it would be a binary fraction) or is not a time.
+    """
+    return _exact(value, what, _SECONDS, "a time in seconds")
+
+
+def hertz(value: object, what: str = "rate") -> Fraction:
+    """Exact hertz from an int, a fraction, a decimal or a string such as ``"100 Hz"``."""
+    return _exact(value, what, _HERTZ, "a rate in hertz")
+
+
+def text_seconds(value: Fraction) -> str:
+    """Write seconds so that `seconds` reads the same number back."""
+    denominator = value.denominator
+    while denominator % 2 == 0:
+        denominator //= 2
+    while denominator % 5 == 0:
+        denominator //= 5
+    if denominator == 1 and abs(value) < 10**15:
+        return f"{Decimal(value.numerator) / Decimal(value.denominator):f}"
+    return f"{value.numerator}/{value.denominator}"
+
+
+def rational_gcd(values: Iterable[Fraction]) -> Fraction:
+    """Greatest rational of which every positive value is an integer multiple."""
+    numerator, denominator = 0, 1
+    for value in values:
+        if value:
+            lcm = math.lcm(denominator, value.denominator)
+            numerator = math.gcd(
+                numerator * (lcm // denominator), value.numerator * (lcm // value.denominator)
+            )
+            denominator = lcm
+    return Fraction(numerator, denominator)
+
+
+@dataclass(frozen=True)
+class Rate:
+    """When a component steps: a period with an offset, or a list of times.
+
+    Activations are at ``offset + k * period`` for k = 0, 1, ..., or at the listed times. Every
+    component is initialized at t = 0 and steps at its activations after 0; it publishes messages
+    at 0 only if 0 is one of its activations (offset 0, the default).
+
+    Parameters
+    ----------
+    period : int, str, Fraction or Decimal, optional
+        Seconds between steps, exact: ``"8.2"``, ``"1/30"``, ``"10 ms"``.
+    hz : int, str, Fraction or Decimal, optional
+        Steps per second, in place of `period`.
+    offset : int, str, Fraction or Decimal
+        Time of the first activation [s].
+    times : sequence, optional
+        Explicit activation times [s], increasing, in place of a period.
+
+    Raises
+    ------
+    RateError
+        If a number is a float, not positive, or the arguments contradict each other.
+    """
+
+    period: Fraction | None
+    offset: Fraction
+    times: tuple[Fraction, ...] | None
+
+    def __init__(
+        self,
+        period: Exact | None = None,
+        *,
+        hz: Exact | None = None,
+        offset: Exact = 0,
+        times: Sequence[Exact] | None = None,
+    ) -> None:
+        if sum(v is not None for v in (period, hz, times)) != 1:
+            raise RateError("give exactly one of a period, hz or times")
+        exact_period: Fraction | None = None
+        exact_times: tuple[Fraction, ...] | None = None
+        if period is not None:
+            exact_period = seconds(period, "period")
+        elif hz is not None:
+            frequency = hertz(hz)
+            if frequency <= 0:
+                raise RateError(f"rate is {hz}; it must be positive")
+            exact_period = 1 / frequency
+        else:
+            assert times is not None
+            if isinstance(times, str):
+                raise RateError(f"times is the text '{times}'; give a list of times")
+            exact_times = tuple(seconds(t, "time") for t in times)
+            if not exact_times:
+                raise RateError("times is empty; give at least one time")
+            if exact_times[0] < 0 or any(
+                b <= a for a, b in zip(exact_times, exact_times[1:], strict=False)
+            ):
+                raise RateError("times must be increasing and not negative")
+        if exact_period is not None and exact_period <= 0:
+            raise RateError(f"period is {period} s; it must be positive")
+        exact_offset = seconds(offset, "offset")
+        if exact_offset < 0:
+            raise RateError(f"offset is {offset} s; it must not be negative")
+        if exact_times is not None and exact_offset:
+            raise RateError("an offset goes with a period, not with a list of times")
+        object.__setattr__(self, "period", exact_period)
+        object.__setattr__(self, "offset", exact_offset)
+        object.__setattr__(self, "times", exact_times)
+
+    @property
+    def starts_at_zero(self) -> bool:
+        """Whether t = 0 is an activation."""
+        return self.times[0] == 0 if self.times else self.offset == 0
+
+    @property
+    def exact_numbers(self) -> tuple[Fraction, ...]:
+        """The numbers that the base step must divide. Listed times are snapped instead."""
+        return () if self.period is None else (self.period, self.offset)
+
+    def ticks(self, base: Fraction) -> Iterator[tuple[int, Fraction]]:
+        """Yield (tick, exact time) of each activation after t = 0.
+
+        A time between two ticks is snapped to the later one: the data exist by then.
+        """
+        if self.times is not None:
+            last = 0
+            for time in self.times:
+                tick = max(math.ceil(time / base), last + 1) if time else 0
+                if tick > 0:
+                    yield tick, time
+                    last = tick
+            return
+        assert self.period is not None
+        step, first = self.period / base, self.offset / base
+        if step.denominator == 1 and first.denominator == 1:  # plain integers: the usual case
+            increment, tick, k = step.numerator, first.numerator, 0
+            if tick == 0:
+                tick, k = increment, 1
+            while True:
+                yield tick, self.offset + k * self.period
+                tick += increment
+                k += 1
+        k = 0 if self.offset else 1
+        while True:
+            time = self.offset + k * self.period
+            yield math.ceil(time / base), time
+            k += 1
+
+    def __str__(self) -> str:
+        if self.times is not None:
+            shown = ", ".join(text_seconds(t) for t in self.times[:4])
+            return f"at {shown}{', ...' if len(self.times) > 4 else ''} s"
+        assert self.period is not None
+        text = f"every {text_seconds(self.period)} s"
+        if self.offset:
+            text += f" from {text_seconds(self.offset)} s"
+        return text
+
+
+def base_step(numbers: Iterable[Fraction], listed: Iterable[Fraction] = ()) -> Fraction:
+    """Choose the base step: the gcd of all exact numbers, else of the listed times, else 1 s."""
+    return rational_gcd(numbers) or rational_gcd(listed) or Fraction(1)

@@ -1,0 +1,319 @@
+"""The master: steps every component that is due, then transfers, in an order fixed beforehand.
+
+It knows ticks, components and links, and nothing of what flows through them. Which components are
+due comes from a heap of next ticks; the work of a tick is a list made once for each combination
+of components that are due together.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from terrafix.cosim.build import Wiring, bind_components, connect_ports
+from terrafix.cosim.check import Plan
+from terrafix.cosim.clock import Rate
+from terrafix.cosim.component import Component
+from terrafix.cosim.errors import StepError, TerrafixError
+from terrafix.cosim.links import Transfer
+
+Mask = NDArray[np.bool_]
+
+
+class _Group:
+    """Components (or one recorder) that step at the same ticks."""
+
+    def __init__(self, rate: Rate, base: Fraction) -> None:
+        self.rate = rate
+        self.base = base
+        self.paths: list[str] = []
+        self.sample: Callable[[float], None] | None = None
+        self.rewind()
+
+    def rewind(self) -> None:
+        """Start again before the first activation."""
+        self._times: Iterator[tuple[int, Fraction]] = self.rate.ticks(self.base)
+        self.tick = 0
+        self.dt = 0.0
+        self.next_tick: int | None = None
+        self._look()
+
+    def _look(self) -> None:
+        following = next(self._times, None)
+        self.next_tick = None if following is None else following[0]
+
+    def advance(self) -> None:
+        """Move to the next activation."""
+        assert self.next_tick is not None
+        ticks = self.next_tick - self.tick
+        self.dt = ticks * self.base.numerator / self.base.denominator
+        self.tick = self.next_tick
+        self._look()
+
+
+class _Entry:
+    """One component's work at a tick."""
+
+    __slots__ = ("after", "before", "clear", "component", "group", "path", "step")
+
+    def __init__(self, path: str, component: Component, group: _Group, wiring: Wiring) -> None:
+        self.path = path
+        self.component = component
+        self.group = group
+        self.step = component.step
+        self.before: tuple[Transfer, ...] = tuple(wiring.before.get(path, ()))
+        self.after = tuple(wiring.after.get(path, ()))
+        self.clear = tuple(wiring.clear.get(path, ()))
+
+
+class Master:
+    """Runs a checked system for one ensemble.
+
+    Parameters
+    ----------
+    plan : Plan
+        From `terrafix.cosim.check.check`.
+    seed : int
+        Root seed.
+    members : ndarray of int64
+        Numbers of the members to fly.
+
+    Attributes
+    ----------
+    tick : int
+        Where the run stands.
+    active : ndarray of bool, shape (n_members,)
+    excluded : list of dict
+        Member, component, time and reason of every failure.
+    component_steps : int
+    """
+
+    def __init__(self, plan: Plan, *, seed: int, members: NDArray[np.int64]) -> None:
+        self.plan = plan
+        self.seed = seed
+        self.members = members
+        self.active: Mask = np.ones(len(members), dtype=np.bool_)
+        self.excluded: list[dict[str, Any]] = []
+        self.tick = 0
+        self.component_steps = 0
+        self._numerator, self._denominator = plan.base.numerator, plan.base.denominator
+        bind_components(plan, seed=seed, members=members, active=self.active, fail=self._exclude)
+        self.draws = {
+            d.name: d.apply(plan.flat.components, seed=seed, members=members)
+            for d in plan.flat.dispersions
+        }
+        self.wiring = connect_ports(plan, len(members), self.active)
+        self._groups: list[_Group] = []
+        self._group_of: dict[str, int] = {}
+        for path in plan.order:
+            rate = plan.flat.components[path].rate
+            assert rate is not None
+            self._group(rate).paths.append(path)
+        self._entries = {
+            path: _Entry(
+                path,
+                plan.flat.components[path],
+                self._groups[self._group_of[path]],
+                self.wiring,
+            )
+            for path in plan.order
+        }
+        self._programs: dict[tuple[int, ...], tuple[Any, ...]] = {}
+        self._heap: list[tuple[int, int]] = []
+
+    def _group(self, rate: Rate) -> _Group:
+        for number, group in enumerate(self._groups):
+            if group.rate == rate and group.sample is None:
+                break
+        else:
+            number, group = len(self._groups), _Group(rate, self.plan.base)
+            self._groups.append(group)
+        for path, component in self.plan.flat.components.items():
+            if component.rate == rate:
+                self._group_of[path] = number
+        return group
+
+    def observe(self, rate: Rate, sample: Callable[[float], None]) -> None:
+        """Call `sample(t)` at a rate, after everything due has stepped. Cannot influence the run."""
+        group = _Group(rate, self.plan.base)
+        group.sample = sample
+        self._groups.append(group)
+
+    def seconds(self, tick: int) -> float:
+        """Time of a tick [s], by one division."""
+        return tick * self._numerator / self._denominator
+
+    def ticks(self, duration: Fraction) -> int:
+        """Number of whole base steps in a duration."""
+        return int(duration / self.plan.base)
+
+    def _exclude(self, path: str, mask: Mask, reason: str) -> None:
+        newly = mask & self.active
+        if not newly.any():
+            return
+        t = self.seconds(self.tick)
+        self.excluded += [
+            {"member": int(m), "component": path, "t_s": t, "reason": reason}
+            for m in self.members[newly]
+        ]
+        self.active &= ~newly
+
+    # ------------------------------------------------------------------ running
+
+    def initialize(self) -> None:
+        """Publish everything at t = 0, in the order of end-reads."""
+        for entry in self._entries.values():
+            try:
+                for transfer in entry.before:
+                    transfer(0)
+                entry.component.initialize()
+            except Exception as error:
+                raise self._step_error(entry.path, 0, error) from error
+            for collect in entry.after:
+                collect(0, 0.0)
+            for clear in entry.clear:
+                clear()
+        for path in self._entries:
+            for transfer in self.wiring.latch.get(path, ()):
+                transfer(0)
+        for group in self._groups:
+            if group.sample is not None and group.rate.starts_at_zero:
+                group.sample(0.0)
+        self._arm()
+
+    def _arm(self) -> None:
+        self._heap = [
+            (g.next_tick, i) for i, g in enumerate(self._groups) if g.next_tick is not None
+        ]
+        heapq.heapify(self._heap)
+
+    def _program(self, due: tuple[int, ...]) -> tuple[Any, ...]:
+        groups = set(due)
+        entries = [e for p, e in self._entries.items() if self._group_of[p] in groups]
+        latches = [t for e in entries for t in self.wiring.latch.get(e.path, ())]
+        samples = [s for i in due if (s := self._groups[i].sample) is not None]
+        program = (tuple(entries), tuple(latches), tuple(samples))
+        self._programs[due] = program
+        return program
+
+    def run_until(self, end: int) -> None:
+        """Step to tick `end`.
+
+        Raises
+        ------
+        StepError
+            If a component fails, or no member is left. What was recorded is untouched.
+        """
+        heap, groups, programs = self._heap, self._groups, self._programs
+        numerator, denominator = self._numerator, self._denominator
+        entry: _Entry | None = None
+        n_excluded = len(self.excluded)
+        try:
+            while heap and heap[0][0] <= end:
+                tick = heap[0][0]
+                if all(tick < later[0] for later in heap[1:3]):  # the children of the root
+                    number = heap[0][1]
+                    due: tuple[int, ...] = (number,)
+                    group = groups[number]
+                    group.advance()
+                    if group.next_tick is None:
+                        heapq.heappop(heap)
+                    else:
+                        heapq.heapreplace(heap, (group.next_tick, number))
+                else:
+                    due = self._pop(tick)
+                program = programs.get(due) or self._program(due)
+                t = tick * numerator / denominator
+                self.tick = tick
+                for entry in program[0]:
+                    for transfer in entry.before:
+                        transfer(tick)
+                    entry.step(t, entry.group.dt)
+                    for collect in entry.after:
+                        collect(tick, t)
+                    for clear in entry.clear:
+                        clear()
+                self.component_steps += len(program[0])
+                entry = None
+                for transfer in program[1]:
+                    transfer(tick)
+                for sample in program[2]:
+                    sample(t)
+                if len(self.excluded) != n_excluded:
+                    n_excluded = len(self.excluded)
+                    self._check_members()
+        except TerrafixError as error:
+            if entry is None or isinstance(error, StepError):
+                raise
+            raise self._step_error(entry.path, self.tick, error) from error
+        except Exception as error:
+            where = entry.path if entry is not None else "recorder"
+            raise self._step_error(where, self.tick, error) from error
+        self.tick = end
+
+    def _pop(self, tick: int) -> tuple[int, ...]:
+        due = []
+        while self._heap and self._heap[0][0] == tick:
+            number = heapq.heappop(self._heap)[1]
+            due.append(number)
+            group = self._groups[number]
+            group.advance()
+            if group.next_tick is not None:
+                heapq.heappush(self._heap, (group.next_tick, number))
+        return tuple(sorted(due))
+
+    def _check_members(self) -> None:
+        if not self.active.any():
+            last = self.excluded[-1]
+            raise StepError(
+                f"no member is left at t = {last['t_s']:g} s (tick {self.tick})\n"
+                f"  the last, member {last['member']}, failed in '{last['component']}': "
+                f"{last['reason']}"
+            )
+
+    def _step_error(self, path: str, tick: int, error: Exception) -> StepError:
+        cause = (
+            str(error) if isinstance(error, TerrafixError) else f"{type(error).__name__}: {error}"
+        )
+        return StepError(
+            f"'{path}' failed at t = {self.seconds(tick):g} s (tick {tick})\n  {cause}"
+        )
+
+    def terminate(self) -> None:
+        """Give back everything components hold, also after a failure."""
+        for component in self.plan.flat.components.values():
+            component.terminate()
+            component.release()
+
+    # ------------------------------------------------------------------ checkpoints
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything that a run needs to continue from here."""
+        return {
+            "tick": self.tick,
+            "component_steps": self.component_steps,
+            "active": self.active.copy(),
+            "excluded": [dict(e) for e in self.excluded],
+            "components": {p: e.component.get_state() for p, e in self._entries.items()},
+            "links": {name: k.get_state() for name, k in self.wiring.keepers.items()},
+        }
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Continue from where `get_state` was called."""
+        self.tick = int(saved["tick"])
+        self.component_steps = int(saved["component_steps"])
+        self.active[:] = saved["active"]
+        self.excluded[:] = [dict(e) for e in saved["excluded"]]
+        for path, state in saved["components"].items():
+            self._entries[path].component.set_state(state)
+        for name, state in saved["links"].items():
+            self.wiring.keepers[name].set_state(state)
+        for group in self._groups:
+            group.rewind()
+            while group.next_tick is not None and group.next_tick <= self.tick:
+                group.advance()
+        self._arm()

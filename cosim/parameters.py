@@ -1,0 +1,312 @@
+"""Declared parameters: what a person sets, validated when it is set.
+
+Numeric parameters have a shape, a unit and a range, and a value per ensemble member once a
+simulation is built, so that a dispersion can feed any of them. Choices, flags, counts, texts and
+paths decide the structure of a component and are the same for all members.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Generic, Self, TypeVar, overload
+
+import numpy as np
+from numpy.typing import NDArray
+from terrafix.cosim.errors import ConfigurationError, nearest
+from terrafix.cosim.ports import Declaration, Unit
+from terrafix.cosim.units import conversion_factor, split_quantity
+
+FloatArray = NDArray[np.float64]
+Value = TypeVar("Value")
+REQUIRED: Any = object()
+
+
+class Setting(Declaration, Generic[Value]):
+    """Base of everything that can be set on a component by name."""
+
+    def __init__(self, default: Any = REQUIRED, *, doc: str = "") -> None:
+        self.default = default
+        self.doc = doc
+
+    @property
+    def required(self) -> bool:
+        """Whether a value must be given."""
+        return self.default is REQUIRED
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> Value:
+        """Turn what a person wrote into the value; `where` names it in errors.
+
+        `bare` allows a number without a unit, taken in the declared unit.
+        """
+        raise NotImplementedError(type(self).__name__)
+
+    def kind(self) -> str:
+        """Describe what is accepted, for listings."""
+        return type(self).__name__.lower()
+
+    def write(self, value: Value) -> Any:
+        """Write a value so that `read` accepts it again (TOML types only)."""
+        return value
+
+    @overload
+    def __get__(self, obj: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, obj: object, owner: type) -> Value: ...
+    def __get__(self, obj: object | None, owner: type) -> Self | Value:
+        if obj is None:
+            return self
+        return obj._settings[self.name]  # type: ignore[attr-defined, no-any-return]
+
+    def __set__(self, obj: object, value: object) -> None:
+        obj._set(self.name, value)  # type: ignore[attr-defined]
+
+
+class Parameter(Setting[FloatArray]):
+    """A number or array with a unit: ndarray, shape (n_members, *shape) in a simulation.
+
+    Parameters
+    ----------
+    default : float or array_like
+        In `unit`; required if absent.
+    shape : tuple of int
+        Of one member.
+    unit : str or tuple of str
+        SI; other units of the same dimension are converted when set.
+    minimum, maximum : float, optional
+        Inclusive bounds in `unit`.
+    positive : bool
+        Refuse zero and less.
+    infinite : bool
+        Accept infinity (a gate that is off, say).
+    """
+
+    def __init__(
+        self,
+        default: Any = REQUIRED,
+        *,
+        shape: Sequence[int] = (),
+        unit: Unit = "1",
+        minimum: float | None = None,
+        maximum: float | None = None,
+        positive: bool = False,
+        infinite: bool = False,
+        doc: str = "",
+    ) -> None:
+        super().__init__(default, doc=doc)
+        self.shape = tuple(shape)
+        self.unit = unit
+        self.minimum, self.maximum = minimum, maximum
+        self.positive, self.infinite = positive, infinite
+
+    def unit_text(self) -> str:
+        """The unit as a person writes it."""
+        return self.unit if isinstance(self.unit, str) else "(" + ", ".join(self.unit) + ")"
+
+    def kind(self) -> str:
+        """Describe what is accepted, for listings."""
+        shape = "number" if not self.shape else f"array {self.shape}"
+        return f"{shape} [{self.unit_text()}]"
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> FloatArray:
+        """Turn a number, array, or text with a unit into an array in the declared unit.
+
+        Raises
+        ------
+        ConfigurationError
+            If it is no number, of another dimension or shape, not finite, or out of range.
+        """
+        unit: str | None = None
+        if isinstance(value, dict):
+            extra = sorted(set(value) - {"value", "unit"})
+            if extra or "value" not in value:
+                raise ConfigurationError(
+                    f"{where} is a table with {sorted(value)}; write {{ value = ..., unit = ... }}"
+                )
+            value, unit = value["value"], value.get("unit")
+        if isinstance(value, str):
+            text = value
+            try:
+                value, unit = split_quantity(value)
+            except ValueError:
+                raise ConfigurationError(
+                    f"{where} is '{text}', which is not a number with a unit\n"
+                    f"  it takes {self.kind()}: write {self._example()}"
+                ) from None
+        if isinstance(value, bool):
+            raise ConfigurationError(f"{where} is {value}; it takes {self.kind()}")
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ConfigurationError(f"{where} is {value!r}; it takes {self.kind()}") from None
+        if array.shape != self.shape:
+            if array.ndim == 0 and self.shape and isinstance(self.unit, str):
+                array = np.full(self.shape, float(array))
+            else:
+                raise ConfigurationError(
+                    f"{where} has shape {array.shape}; it takes {self.kind()}: "
+                    f"write {self._example()}"
+                )
+        array = self._convert(array, unit, where=where, bare=bare)
+        self._check_range(array, where)
+        return array
+
+    def _convert(
+        self, array: FloatArray, unit: str | None, *, where: str, bare: bool
+    ) -> FloatArray:
+        if unit is None:
+            if not bare and self.unit not in ("1", "") and not np.all(array == 0.0):
+                raise ConfigurationError(
+                    f"{where} has no unit\n  it takes {self.kind()}: write {self._example()}"
+                )
+            return array
+        if not isinstance(self.unit, str):
+            raise ConfigurationError(
+                f"{where} has elements of different units {self.unit_text()}; give bare SI numbers"
+            )
+        factor = conversion_factor(unit, self.unit)
+        if factor is None:
+            raise ConfigurationError(
+                f"{where} is given in {unit}; it takes {self.kind()}\n"
+                f"  the units differ: {unit} is not {self.unit}"
+            )
+        return array * factor
+
+    def _example(self) -> str:
+        unit = "" if self.unit_text() in ("1", "") else f" {self.unit_text()}"
+        number = "1.0" if not self.shape else "[" + ", ".join(["1.0"] * self.shape[0]) + "]"
+        return f'"{number}{unit}"'
+
+    def _check_range(self, array: FloatArray, where: str) -> None:
+        bad: str | None = None
+        if np.isnan(array).any():
+            bad = "is not a number (NaN)"
+        elif not self.infinite and np.isinf(array).any():
+            bad = "is infinite"
+        elif self.positive and (array <= 0).any():
+            bad = "must be positive"
+        elif self.minimum is not None and (array < self.minimum).any():
+            bad = f"must be at least {self.minimum:g} {self.unit_text()}"
+        elif self.maximum is not None and (array > self.maximum).any():
+            bad = f"must be at most {self.maximum:g} {self.unit_text()}"
+        if bad:
+            shown = array.tolist()
+            if bad.startswith("must"):
+                raise ConfigurationError(f"{where} is {shown} {self.unit_text()}; it {bad}")
+            raise ConfigurationError(f"{where} = {shown} {bad}; give a finite number")
+
+    def write(self, value: FloatArray) -> Any:
+        """Write a value with its unit as text."""
+        if not isinstance(self.unit, str):
+            return np.asarray(value).tolist()
+        text = str(np.asarray(value).tolist())
+        return text if self.unit in ("1", "") else f"{text} {self.unit}"
+
+
+class Count(Setting[int]):
+    """A whole number."""
+
+    def __init__(
+        self,
+        default: Any = REQUIRED,
+        *,
+        minimum: int = 0,
+        maximum: int | None = None,
+        doc: str = "",
+    ) -> None:
+        super().__init__(default, doc=doc)
+        self.minimum, self.maximum = minimum, maximum
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> int:  # noqa: ARG002 - no unit
+        """Accept an integer, or text of one."""
+        if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d+\s*", value):
+            value = int(value)
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise ConfigurationError(f"{where} is {value!r}; it takes a whole number")
+        if value < self.minimum or (self.maximum is not None and value > self.maximum):
+            upper = "" if self.maximum is None else f" and at most {self.maximum}"
+            raise ConfigurationError(
+                f"{where} is {value}; it must be at least {self.minimum}{upper}"
+            )
+        return value
+
+
+class Flag(Setting[bool]):
+    """True or false."""
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> bool:  # noqa: ARG002 - no unit
+        """Accept a boolean, or the text ``true`` or ``false``."""
+        if isinstance(value, str) and value.strip().lower() in ("true", "false"):
+            return value.strip().lower() == "true"
+        if not isinstance(value, bool):
+            raise ConfigurationError(f"{where} is {value!r}; it takes true or false")
+        return value
+
+
+class Choice(Setting[str]):
+    """One of several names."""
+
+    def __init__(self, options: Sequence[str], default: Any = REQUIRED, *, doc: str = "") -> None:
+        super().__init__(default, doc=doc)
+        self.options = tuple(options)
+
+    def kind(self) -> str:
+        """Describe what is accepted, for listings."""
+        return " | ".join(f'"{o}"' for o in self.options)
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> str:  # noqa: ARG002 - no unit
+        """Accept one of the options."""
+        if not isinstance(value, str) or value not in self.options:
+            hint = nearest(str(value), self.options)
+            raise ConfigurationError(f"{where} is {value!r}; it takes {self.kind()}\n  {hint}")
+        return value
+
+
+class Text(Setting[str]):
+    """Free text."""
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> str:  # noqa: ARG002 - no unit
+        """Accept text."""
+        if not isinstance(value, str):
+            raise ConfigurationError(f"{where} is {value!r}; it takes text")
+        return value
+
+
+_VARIABLE = re.compile(r"\$\{(\w+)(?::-([^}]*))?\}|\$(\w+)")
+
+
+class FilePath(Setting[Path]):
+    """A file: relative to the system file, with ``${NAME:-fallback}`` from the environment."""
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> Path:  # noqa: ARG002 - no unit
+        """Accept a path; environment variables and ``~`` are expanded."""
+        if isinstance(value, Path):
+            return value
+        if not isinstance(value, str) or not value.strip():
+            raise ConfigurationError(f"{where} is {value!r}; it takes the path of a file")
+
+        def expand(match: re.Match[str]) -> str:
+            name = match[1] or match[3]
+            found = os.environ.get(name) or match[2]
+            if found is None:
+                raise ConfigurationError(
+                    f"{where} is '{value}', but the environment variable {name} is not set\n"
+                    f"  set {name}, or write ${{{name}:-fallback}}"
+                )
+            return found
+
+        return Path(_VARIABLE.sub(expand, value)).expanduser()
+
+    def write(self, value: Path) -> str:
+        """Write the path as text."""
+        return str(value)
+
+
+def finite_float(value: object, where: str) -> float:
+    """Read a finite number or raise ConfigurationError naming `where`."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ConfigurationError(f"{where} is {value!r}; it takes a finite number")
+    return float(value)

@@ -1,0 +1,201 @@
+"""Labeled results: recorded chunks as an `xarray.Dataset`, and NetCDF files of them."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from terrafix.cosim.errors import ConfigurationError
+from terrafix.cosim.ports import Field
+from terrafix.cosim.record import MANIFEST, Recorder, Variable, _join, _read_chunks
+
+if TYPE_CHECKING:
+    import xarray
+
+SCHEMA = "terrafix-result/1"
+
+
+def time_dimension(name: str, *, only: bool) -> str:
+    """Name of a recorder's time axis: ``time`` if it is the only one, else ``time_<record>``."""
+    return "time" if only else f"time_{name}"
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": platform.python_version()}
+    for package in ("terrafix", "numpy", "casadi", "scipy", "fmpy"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def cpu_name() -> str:
+    """Type of the processor, as far as the system tells."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+class _Labels:
+    """Dimensions of variables, shared where size and labels agree."""
+
+    def __init__(self) -> None:
+        self.coordinates: dict[str, list[str]] = {}
+
+    def names(self, field: Field, shape: tuple[int, ...]) -> list[str]:
+        names: list[str] = []
+        for axis, size in enumerate(shape):
+            last = axis == len(shape) - 1
+            if last and field.labels:
+                name = "_".join(["axis", *field.labels])
+                self.coordinates[name] = list(field.labels)
+            else:
+                name = f"dim_{size}"
+            while name in names:
+                name += "b"
+            names.append(name)
+        return names
+
+
+def build_dataset(
+    records: Mapping[str, tuple[NDArray[np.float64], list[tuple[str, Field, NDArray[Any]]]]],
+    members: NDArray[np.int64],
+    attributes: Mapping[str, Any],
+    parameters: Mapping[str, tuple[str, NDArray[Any]]] | None = None,
+) -> xarray.Dataset:
+    """Label recorded arrays.
+
+    Parameters
+    ----------
+    records : mapping
+        By recorder: times (n,), and (name, field, values (n, n_members, *shape)).
+    members : ndarray
+        Member numbers.
+    attributes : mapping
+        Of the dataset; anything but text and numbers is stored as JSON.
+    parameters : mapping, optional
+        Read back from the components: (unit, values (n_members, *shape)) by path.
+    """
+    import xarray
+
+    labels = _Labels()
+    variables: dict[str, Any] = {}
+    coordinates: dict[str, Any] = {"member": members}
+    seen: set[str] = set()
+    for record, (times, arrays) in records.items():
+        dimension = time_dimension(record, only=len(records) == 1)
+        coordinates[dimension] = (dimension, times, {"units": "s", "long_name": "time"})
+        for name, field, values in arrays:
+            key = name if name not in seen else f"{name}@{record}"
+            seen.add(name)
+            dims = [dimension, "member", *labels.names(field, values.shape[2:])]
+            about = {"units": field.unit_text(), "long_name": field.doc, "frame": field.frame or ""}
+            variables[key] = (dims, values, {k: v for k, v in about.items() if v})
+    for path, (unit, values) in (parameters or {}).items():
+        dims = ["member", *labels.names(Field(), values.shape[1:])]
+        variables[f"parameter:{path}"] = (dims, values, {"units": unit})
+    coordinates |= {k: v for k, v in labels.coordinates.items()}
+    plain = {
+        k: v if isinstance(v, str | int | float) else json.dumps(v) for k, v in attributes.items()
+    }
+    return xarray.Dataset(variables, coordinates, {"schema": SCHEMA} | plain)
+
+
+def from_recorders(recorders: list[Recorder]) -> dict[str, Any]:
+    """Read back what recorders hold, in the form `build_dataset` takes."""
+    found: dict[str, Any] = {}
+    for recorder in recorders:
+        times, arrays = recorder.history()
+        found[recorder.name] = (
+            times,
+            [(v.name, v.field, arrays[v.name]) for v in recorder.variables],
+        )
+    return found
+
+
+def write_netcdf(dataset: xarray.Dataset, path: Path) -> None:
+    """Write a dataset to a NetCDF-4 file, whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        dataset.to_netcdf(partial, engine="netcdf4", format="NETCDF4")
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise ConfigurationError(f"cannot write '{path}': {error.strerror or error}") from error
+
+
+def read_result(path: str | Path) -> xarray.Dataset:
+    """Read a result file.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file is absent, damaged, no result, or of a schema this version cannot read.
+    """
+    import xarray
+
+    path = Path(path)
+    if not path.is_file():
+        raise ConfigurationError(f"there is no result file '{path}'")
+    try:
+        dataset = xarray.load_dataset(path, engine="netcdf4")
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ConfigurationError(f"'{path}' is damaged or no NetCDF file: {error}") from error
+    schema = dataset.attrs.get("schema")
+    if schema != SCHEMA:
+        raise ConfigurationError(
+            f"'{path}' has schema {schema!r}; this version reads {SCHEMA!r}\n"
+            "  read it with the version of terrafix that wrote it"
+        )
+    return dataset
+
+
+def salvage(folder: str | Path) -> xarray.Dataset:
+    """Build a dataset from the chunks that an interrupted run left behind.
+
+    Raises
+    ------
+    ConfigurationError
+        If the folder holds no records.
+    """
+    folder = Path(folder)
+    try:
+        description = json.loads((folder / MANIFEST).read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise ConfigurationError(f"'{folder}' holds no records: {error}") from error
+    records: dict[str, Any] = {}
+    for name, variables in description["recorders"].items():
+        fields = [
+            Field(
+                tuple(v["shape"]),
+                v["unit"] if isinstance(v["unit"], str) else tuple(v["unit"]),
+                v["frame"],
+                np.dtype(v["dtype"]),
+                v["ragged"],
+                tuple(v["labels"]),
+                v["doc"],
+            )
+            for v in variables
+        ]
+        chunks = _read_chunks(folder, name)
+        if not chunks:
+            continue
+        declared = [Variable(v["name"], f) for v, f in zip(variables, fields, strict=True)]
+        times, arrays = _join(chunks, declared, [])
+        records[name] = (times, [(d.name, d.field, arrays[d.name]) for d in declared])
+    about = description["about"]
+    members = np.asarray(about["members"], dtype=np.int64)
+    return build_dataset(records, members, about | {"status": "interrupted"})

@@ -1,0 +1,260 @@
+"""Components whose step is a symbolic model: stepped for all members by one kernel call.
+
+The model satisfies a small protocol (`SymbolicModel`); nothing here knows which mathematics it
+holds. Names in the model are bound to ports by name: ``"delta_v"`` to a signal, ``"fix.y"`` to a
+field of a bundle or message, ``"fix.fresh"`` and ``"fix.t"`` to a message's freshness and time of
+validity, and the output ``"fix.valid"`` says which members a message reaches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from terrafix.cosim.buffers import BundleView, MessageReader, MessageWriter
+from terrafix.cosim.component import Component, Environment
+from terrafix.cosim.errors import ConfigurationError, nearest
+from terrafix.cosim.kernels import Argument, BoundKernel, Kernel, Result
+from terrafix.cosim.noise import stream_key
+from terrafix.cosim.parameters import Parameter
+from terrafix.cosim.ports import Capabilities
+
+FloatArray = NDArray[np.float64]
+Symbols = Mapping[str, Any]
+
+
+class SymbolicModel(Protocol):
+    """What is needed of a model: names, shapes, and two functions of flat row-major arguments."""
+
+    name: str
+
+    @property
+    def inputs(self) -> Symbols:
+        """Inputs by name."""
+
+    @property
+    def outputs(self) -> Symbols:
+        """Outputs by name."""
+
+    @property
+    def states(self) -> Symbols:
+        """States by name."""
+
+    @property
+    def parameters(self) -> Symbols:
+        """Parameters by name."""
+
+    @property
+    def noise(self) -> Symbols:
+        """Noise vectors by name, standard normal."""
+
+    @property
+    def step(self) -> Any:
+        """Symbol of the step length, or None."""
+
+    @property
+    def time(self) -> Any:
+        """Symbol of the time, or None."""
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Shape of a named quantity."""
+
+    def step_function(self) -> Any:
+        """(inputs, states, parameters, noise, step, time) to (outputs, states)."""
+
+    def initial_function(self) -> Any:
+        """(inputs, parameters, noise, step, time) to (outputs, states)."""
+
+
+class SymbolicComponent(Component):
+    """A component that is a model plus ports and a rate.
+
+    A subclass declares ports and parameters and provides `build_model`, which may look at
+    structural settings (choices, flags, counts) but not at numbers: those are arguments of the
+    kernel, one value per member.
+    """
+
+    capabilities: ClassVar[Capabilities] = Capabilities(symbolic=True)
+
+    def build_model(self) -> SymbolicModel:
+        """Build the model for the present structural settings."""
+        raise NotImplementedError(f"{type(self).__name__} must provide build_model()")
+
+    @property
+    def model(self) -> SymbolicModel:
+        """The model, built on first need for the present settings."""
+        structure = tuple(
+            (n, self._base.get(n))
+            for n, s in self.settings().items()
+            if not isinstance(s, Parameter)
+        )
+        if self._model is None or self._model[0] != structure:
+            self._model = (structure, self.build_model())
+        return self._model[1]
+
+    _model: tuple[Any, SymbolicModel] | None = None
+
+    def validate(self) -> None:
+        """Check that every name of the model is a port or parameter of this component."""
+        model = self.model
+        for name in model.inputs:
+            self._check_name(name, self.inputs(), {"fresh", "t"}, "input")
+        for name in model.outputs:
+            self._check_name(name, self.outputs(), {"valid"}, "output")
+        for name in model.parameters:
+            if not isinstance(self.settings().get(name), Parameter):
+                raise ConfigurationError(
+                    f"model '{model.name}' has a parameter '{name}' that {type(self).__name__} "
+                    "does not declare"
+                )
+
+    def _check_name(self, name: str, ports: Mapping[str, Any], extra: set[str], side: str) -> None:
+        head, _, tail = name.partition(".")
+        port = ports.get(head)
+        if port is None:
+            raise ConfigurationError(
+                f"model '{self.model.name}' has an {side} '{name}', but {type(self).__name__} has "
+                f"no such port\n  {nearest(head, ports, what='its ports')}"
+            )
+        known = set(port.fields) | (extra if port.kind == "message" else set())
+        if tail not in known:
+            raise ConfigurationError(
+                f"model '{self.model.name}' has an {side} '{name}', but port '{head}' has no "
+                f"'{tail}'\n  {nearest(tail, known)}"
+            )
+        if tail in port.fields and self.model.shape(name) != port.fields[tail].shape:
+            size = int(np.prod(self.model.shape(name)))
+            if not (size == 1 and port.fields[tail].shape == ()):
+                raise ConfigurationError(
+                    f"model '{self.model.name}': '{name}' has shape {self.model.shape(name)}, "
+                    f"the port declares {port.fields[tail].shape}"
+                )
+
+    # ------------------------------------------------------------------ kernels
+
+    def kernel_request(self) -> tuple[Any, list[Argument], list[Result]]:
+        """What to build the step kernel from: function, arguments, results."""
+        model = self.model
+
+        def size(name: str) -> int:
+            return int(np.prod(model.shape(name), dtype=np.int64))
+
+        arguments = [Argument(n, size(n), "array") for n in model.inputs]
+        arguments += [Argument(f"state:{n}", size(n), "array") for n in model.states]
+        arguments += [Argument(n, size(n), "array") for n in model.parameters]
+        arguments += [Argument(n, size(n), "noise") for n in model.noise]
+        if model.step is not None:
+            arguments.append(Argument("step", 1, "shared"))
+        if model.time is not None:
+            arguments.append(Argument("time", 1, "shared"))
+        results = [Result(n, size(n)) for n in model.outputs]
+        results += [Result(f"state:{n}", size(n)) for n in model.states]
+        return model.step_function(), arguments, results
+
+    def bind(self, environment: Environment) -> None:
+        """Get arrays for states and parameters."""
+        super().bind(environment)
+        n = environment.n_members
+        for name in self.model.states:
+            self._states[name] = np.zeros((n, *self._state_shape(name)))
+        self._dt = np.zeros(1)
+        self._t = np.zeros(1)
+        self._failed = np.zeros(n, dtype=np.uint8)
+
+    def _state_shape(self, name: str) -> tuple[int, ...]:
+        shape = self.model.shape(name)
+        return () if shape == (1,) else shape
+
+    def bind_kernel(self, kernel: Kernel) -> None:
+        """Tie the kernel to this component's arrays, once ports are bound."""
+        env = self.environment
+        model = self.model
+        arrays = {n: self._input_array(n) for n in model.inputs}
+        arrays |= {f"state:{n}": self._states[n] for n in model.states}
+        arrays |= {n: self._settings[n] for n in model.parameters}
+        arrays |= {"step": self._dt, "time": self._t}
+        self._messages: dict[str, FloatArray] = {}
+        results = {n: self._output_array(n) for n in model.outputs}
+        results |= {f"state:{n}": self._states[n] for n in model.states}
+        keys = {n: stream_key(env.seed, env.path, n) for n in model.noise}
+        self.kernel = kernel
+        self._call: BoundKernel = kernel.bind(
+            env.n_members,
+            arrays,
+            results,
+            members=env.members,
+            noise_keys=keys,
+            active=env.active,
+            failed=self._failed,
+        )
+
+    def _input_array(self, name: str) -> FloatArray:
+        head, _, tail = name.partition(".")
+        view = self._views[head]
+        if isinstance(view, MessageReader):
+            if tail == "fresh":
+                return view.fresh_number
+            return view.t if tail == "t" else view.slot.views[tail]
+        if isinstance(view, BundleView):
+            array: FloatArray = view.__dict__[tail]
+            return array
+        plain: FloatArray = view
+        return plain
+
+    def _output_array(self, name: str) -> FloatArray:
+        head, _, tail = name.partition(".")
+        view = self._views[head]
+        if isinstance(view, MessageWriter):
+            self._messages.setdefault(head, np.ones(self.n_members))
+            if tail == "valid":
+                return self._messages[head]
+            draft: FloatArray = view.draft[tail]
+            return draft
+        if isinstance(view, BundleView):
+            array: FloatArray = view.__dict__[tail]
+            return array
+        plain: FloatArray = view
+        return plain
+
+    # ------------------------------------------------------------------ life cycle
+
+    def _initialize_impl(self) -> None:
+        model, env = self.model, self.environment
+        function = model.initial_function()
+        inputs = [self._input_array(n).reshape(self.n_members, -1) for n in model.inputs]
+        inputs += [self._settings[n].reshape(self.n_members, -1) for n in model.parameters]
+        inputs += [self.normals(n, int(np.prod(model.shape(n)))) for n in model.noise]
+        clock = [0.0] * ((model.step is not None) + (model.time is not None))
+        outputs = {n: self._output_array(n) for n in model.outputs}
+        targets = [*outputs.values(), *(self._states[n] for n in model.states)]
+        for m in range(self.n_members):
+            if not env.active[m]:
+                continue
+            results = function(*(a[m] for a in inputs), *clock)
+            results = results if isinstance(results, tuple) else (results,)
+            values = [np.asarray(r, dtype=np.float64).reshape(-1) for r in results]
+            if not all(np.isfinite(v).all() for v in values):
+                self.fail(env.members == env.members[m], "start is not finite")
+                continue
+            for target, value in zip(targets, values, strict=True):
+                target[m] = value.reshape(target.shape[1:])
+        if self.publishes_at_start:
+            self._publish_messages(0.0)
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        self._t[0] = t
+        self._dt[0] = dt
+        if self._call(self.step_index):
+            failed = self._failed.astype(np.bool_)
+            self._failed[:] = 0
+            self.fail(failed, "result is not finite")
+        if self._messages:
+            self._publish_messages(t)
+
+    def _publish_messages(self, t: float) -> None:
+        for name, valid in self._messages.items():
+            mask = valid > 0.5
+            if mask.any():
+                self._views[name].publish_draft(t, mask)

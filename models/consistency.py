@@ -1,0 +1,124 @@
+r"""Is a filter's covariance that of its errors? Normalized squares and their bounds.
+
+.. math::
+    \epsilon = e^T P^{-1} e
+
+is chi-square with :math:`n` degrees of freedom where the filter is consistent; the mean over
+:math:`N` members times :math:`N` is chi-square with :math:`N n`.
+
+References
+----------
+.. [1] Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
+       Navigation", Wiley, 2001, section 5.4.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from terrafix.models.model import FloatArray
+
+
+def normalized_square(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
+    """Square of each member's error, normalized: NEES of an estimate, NIS of an innovation.
+
+    Solved by a Cholesky factorization that runs over all members at once, element by element: a
+    member's value does not depend on the others, and a member whose covariance is not positive
+    definite gets NaN instead of stopping them.
+
+    Parameters
+    ----------
+    error : array_like, shape (..., n)
+        Errors or innovations; the sign does not matter.
+    covariance : array_like, shape (..., n, n)
+        Their covariances; the lower triangle is read.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        NaN where the covariance is not positive definite or anything is not finite.
+
+    Raises
+    ------
+    ValueError
+        If the shapes disagree.
+    """
+    e, P = np.asarray(error, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    n = e.shape[-1]
+    if P.shape != (*e.shape, n):
+        raise ValueError(f"errors of shape {e.shape} do not fit covariances of shape {P.shape}")
+    diagonal = np.diagonal(P, axis1=-2, axis2=-1)
+    finite = np.isfinite(e).all(axis=-1) & np.isfinite(P).all(axis=(-2, -1))
+    valid = np.asarray(finite & (diagonal > 0).all(axis=-1))
+    safe_P = np.where(valid[..., None, None], P, np.eye(n))
+    safe_e = np.where(valid[..., None], e, 0.0)
+    # scale to unit diagonal: the elements have different units
+    sigma = np.sqrt(np.diagonal(safe_P, axis1=-2, axis2=-1))
+    P = safe_P / (sigma[..., :, None] * sigma[..., None, :])
+    e = safe_e / sigma
+    L = np.zeros_like(P)
+    whitened = np.zeros_like(e)
+    total = np.zeros(e.shape[:-1])
+    for j in range(n):
+        pivot = P[..., j, j].copy()
+        for k in range(j):
+            pivot -= L[..., j, k] * L[..., j, k]
+        valid &= pivot > 0
+        L[..., j, j] = np.sqrt(np.where(pivot > 0, pivot, 1.0))
+        remaining = e[..., j].copy()
+        for k in range(j):
+            remaining -= L[..., j, k] * whitened[..., k]
+        whitened[..., j] = remaining / L[..., j, j]
+        total += whitened[..., j] * whitened[..., j]
+        for i in range(j + 1, n):
+            below = P[..., i, j].copy()
+            for k in range(j):
+                below -= L[..., i, k] * L[..., j, k]
+            L[..., i, j] = below / L[..., j, j]
+    return np.where(valid, total, np.nan)
+
+
+def mean_bounds(dof: float, n_samples: int, probability: float = 0.95) -> tuple[float, float]:
+    """Two-sided bounds of the mean of independent chi-square samples.
+
+    Parameters
+    ----------
+    dof : float
+        Degrees of freedom of one sample.
+    n_samples : int
+        Samples in the mean.
+    probability : float
+        Of the mean lying between the bounds.
+
+    Raises
+    ------
+    ValueError
+        If there is no sample, or `probability` is not between 0 and 1.
+    """
+    if n_samples < 1:
+        raise ValueError(f"a mean wants one sample at least, got {n_samples}")
+    if not 0 < probability < 1:
+        raise ValueError(f"probability must be between 0 and 1, got {probability}")
+    from scipy.stats import chi2
+
+    tail = (1 - probability) / 2
+    lower, upper = chi2.ppf([tail, 1 - tail], dof * n_samples) / n_samples
+    return float(lower), float(upper)
+
+
+def gate_thresholds(probability: float, max_dof: int = 4) -> FloatArray:
+    """Chi-square values below which a fraction of good innovations lies, (max_dof,).
+
+    Element k - 1 is for k degrees of freedom; `probability` 1 gives infinity, no gate.
+
+    Raises
+    ------
+    ValueError
+        If `probability` is not above 0 and at most 1.
+    """
+    if not 0 < probability <= 1:
+        raise ValueError(f"probability must be in (0, 1], got {probability}")
+    from scipy.stats import chi2
+
+    return np.asarray(chi2.ppf(probability, np.arange(1, max_dof + 1)), dtype=np.float64)

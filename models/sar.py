@@ -1,0 +1,212 @@
+r"""What a synthetic aperture radar tells a navigator: two boresight tangents, range and speed.
+
+The pixel at the center line, at the azimuth time of zero Doppler, lies on the antenna's boresight,
+so its two measured tangents are zero by construction. Predicted from an estimate they are not:
+
+.. math::
+    r^s = T(\delta\mu)\, T(q_\mu)\, T(q_{sb})\, T(q_{be})\, (r_f - r), \qquad
+    y = \begin{bmatrix} x_s / z_s & y_s / z_s & \lVert r_f - r \rVert & \lVert v \rVert
+        \end{bmatrix}^T
+
+with :math:`r_f` the pixel's position and :math:`q_\mu` the misalignment of the antenna, whose
+error rotates from the left, :math:`T(\delta\mu) \approx I - [\delta\mu \times]`.
+
+Antenna axes: z along the boresight, x along the track, y across it.
+
+References
+----------
+.. [1] B. S. Pogorelsky, R. Zanetti, J. Chen, S. Jenkins, "Synthetic Aperture Radar Based
+       Spacecraft Terrain Relative Navigation", eqs. (16)-(34). The component :math:`z_s` is
+       called the slant range there; it equals it only at zero residual. The conference version
+       omits :math:`T(q_{be})`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+from terrafix.models.geodesy import ellipsoid_intersection
+from terrafix.models.model import Model
+from terrafix.models.quaternion import (
+    from_rotation_vector,
+    from_small_rotation_vector,
+    normalized,
+    product,
+    rotation_matrix,
+)
+
+BORESIGHTS = ("true", "nominal")
+"""Which boresight the synthetic pixel lies on."""
+
+
+def nominal_antenna(look: Any, squint: Any) -> Any:
+    r"""Quaternion ``q_sb`` (4,), body to antenna, of a right-looking antenna.
+
+    The boresight in body axes (x forward, y right, z nadir) is
+    :math:`(\sin\psi, \sin\lambda \cos\psi, \cos\lambda \cos\psi)`; the antenna's x axis is the
+    forward direction orthogonal to it, its y axis completes the triad.
+
+    Parameters
+    ----------
+    look : SX or float
+        Angle :math:`\lambda` from nadir to the boresight, positive to the right [rad].
+    squint : SX or float
+        Angle :math:`\psi` of the boresight ahead of the plane across the track [rad].
+    """
+    about_x = ca.vertcat(-ca.sin(look / 2), 0, 0, ca.cos(look / 2))
+    about_y = ca.vertcat(0, ca.sin(squint / 2), 0, ca.cos(squint / 2))
+    return product(about_y, about_x)
+
+
+def boresight_direction(q_be: Any, q_sb: Any, q_mu: Any) -> Any:
+    """Earth-fixed direction (3,) of the antenna's z axis."""
+    return rotation_matrix(product(q_mu, product(q_sb, q_be)))[2, :].T
+
+
+def predicted_measurement(
+    r_e: Any, v_e: Any, q_mu: Any, dmu: Any, q_be: Any, q_sb: Any, r_f_e: Any
+) -> Any:
+    """Measurement (4,) predicted at a state: two tangents [-], range [m], speed [m/s].
+
+    Eqs. (18)-(22) of [1]_. Undefined where the pixel lies across the boresight.
+
+    Parameters
+    ----------
+    r_e, v_e : SX, shape (3,)
+        Position [m] and velocity [m/s] of the spacecraft, Earth-fixed.
+    q_mu : SX, shape (4,)
+        Misalignment of the antenna, nominal to actual axes.
+    dmu : SX, shape (3,)
+        Error of the misalignment, a rotation vector in actual antenna axes [rad].
+    q_be, q_sb : SX, shape (4,)
+        Earth-fixed to body, and body to nominal antenna axes.
+    r_f_e : SX, shape (3,)
+        Position of the pixel [m], Earth-fixed.
+    """
+    line_e = r_f_e - r_e
+    q_se = product(q_mu, product(q_sb, q_be))
+    line_s = ca.mtimes(rotation_matrix(q_se), line_e)
+    line_s = ca.mtimes(rotation_matrix(from_rotation_vector(dmu)), line_s)
+    return ca.vertcat(
+        line_s[0] / line_s[2],
+        line_s[1] / line_s[2],
+        ca.sqrt(ca.dot(line_e, line_e)),
+        ca.sqrt(ca.dot(v_e, v_e)),
+    )
+
+
+def sar_measurement_model() -> Model:
+    """Four-element measurement as a function of the state, its error and the pixel.
+
+    Returns
+    -------
+    Model
+        Inputs as the arguments of `predicted_measurement`; output ``y`` (4,). Jacobians by
+        ``r_e``, ``v_e``, ``dmu`` and ``r_f_e``.
+    """
+    inputs = {
+        name: ca.SX.sym(name, 4 if name.startswith("q_") else 3)
+        for name in ("r_e", "v_e", "q_mu", "dmu", "q_be", "q_sb", "r_f_e")
+    }
+    return Model(
+        "sar_measurement",
+        inputs=inputs,
+        outputs={"y": predicted_measurement(**inputs)},
+        jacobians=[("y", "r_e"), ("y", "v_e"), ("y", "dmu"), ("y", "r_f_e")],
+    )
+
+
+def antenna_mount_model() -> Model:
+    r"""Misalignment of the true antenna: a draw at the start, then a random walk.
+
+    .. math::
+        q_\mu^+ = \delta q(\sigma_w \sqrt{\Delta t}\, n) \otimes q_\mu, \qquad
+        q_{\mu,0} = \delta q(\sigma_0 n)
+
+    Returns
+    -------
+    Model
+        Parameters ``misalignment_sigma0`` [rad] and ``misalignment_walk`` [rad/sqrt(s)], per
+        axis; output ``q_mu`` (4,).
+    """
+    q_mu, noise, dt = ca.SX.sym("q_mu", 4), ca.SX.sym("misalignment_noise", 3), ca.SX.sym("dt")
+    sigma0, walk = ca.SX.sym("misalignment_sigma0"), ca.SX.sym("misalignment_walk")
+    increment = from_small_rotation_vector(walk * ca.sqrt(dt) * noise)
+    return Model(
+        "antenna_mount",
+        states={"q_mu": q_mu},
+        parameters={"misalignment_sigma0": sigma0, "misalignment_walk": walk},
+        noise={"misalignment_noise": noise},
+        next={"q_mu": normalized(product(increment, q_mu))},
+        initial={"q_mu": from_rotation_vector(sigma0 * noise)},
+        outputs={"q_mu": q_mu},
+        step=dt,
+    )
+
+
+def synthetic_fix_model(boresight: str = "true") -> Model:
+    r"""Fix without an image: where the boresight meets the ellipsoid, with given errors.
+
+    The measured tangents are exactly zero. The range is that to the true pixel; the error of
+    geolocation enters the pixel's reported position alone.
+
+    Parameters
+    ----------
+    boresight : {"true", "nominal"}
+        Whether the pixel lies on the misaligned boresight, as it does, or on the nominal one:
+        a mistake that the innovations do not show, kept as a negative control.
+
+    Returns
+    -------
+    Model
+        Inputs ``r_e`` [m], ``v_e`` [m/s], (3,), ``q_be``, ``q_mu``, (4,). Parameters ``look``,
+        ``squint`` [rad], ``range_sigma`` [m], ``speed_sigma`` [m/s], ``geolocation_sigma`` and
+        ``geolocation_bias`` (3,) Earth-fixed [m], ``radius`` [m], ``flattening``. Outputs
+        ``fix.y`` (4,), ``fix.r_f_e`` (3,) [m], ``fix.R`` (4, 4), ``fix.D`` (3, 3),
+        ``fix.present`` (4,) ones, and ``fix.valid``, 1 where the boresight meets the ellipsoid.
+
+    Raises
+    ------
+    ValueError
+        If `boresight` is not a known choice.
+    """
+    if boresight not in BORESIGHTS:
+        raise ValueError(f"boresight must be one of {BORESIGHTS}, got '{boresight}'")
+    r_e, v_e = ca.SX.sym("r_e", 3), ca.SX.sym("v_e", 3)
+    q_be, q_mu = ca.SX.sym("q_be", 4), ca.SX.sym("q_mu", 4)
+    scalars = ("look", "squint", "range_sigma", "speed_sigma", "radius", "flattening")
+    parameters = {name: ca.SX.sym(name) for name in scalars}
+    look, squint, range_sigma, speed_sigma, radius, flattening = parameters.values()
+    sigma, bias = ca.SX.sym("geolocation_sigma", 3), ca.SX.sym("geolocation_bias", 3)
+    range_noise, speed_noise = ca.SX.sym("range_noise"), ca.SX.sym("speed_noise")
+    noise = ca.SX.sym("geolocation_noise", 3)
+    q_pixel = q_mu if boresight == "true" else ca.SX([0, 0, 0, 1])
+    direction = boresight_direction(q_be, nominal_antenna(look, squint), q_pixel)
+    r_f_e, hit = ellipsoid_intersection(r_e, direction, radius, flattening)
+    line = r_f_e - r_e
+    y = ca.vertcat(
+        0,
+        0,
+        ca.sqrt(ca.dot(line, line)) + range_sigma * range_noise,
+        ca.sqrt(ca.dot(v_e, v_e)) + speed_sigma * speed_noise,
+    )
+    return Model(
+        "synthetic_fix",
+        inputs={"r_e": r_e, "v_e": v_e, "q_be": q_be, "q_mu": q_mu},
+        parameters={**parameters, "geolocation_sigma": sigma, "geolocation_bias": bias},
+        noise={
+            "range_noise": range_noise,
+            "speed_noise": speed_noise,
+            "geolocation_noise": noise,
+        },
+        outputs={
+            "fix.y": y,
+            "fix.r_f_e": r_f_e + sigma * noise + bias,
+            "fix.R": ca.diag(ca.vertcat(0, 0, range_sigma**2, speed_sigma**2)),
+            "fix.D": ca.diag(sigma**2),
+            "fix.present": ca.SX.ones(4),
+            "fix.valid": hit,
+        },
+    )
