@@ -1,0 +1,1 @@
+"""Components of terrain-relative navigation: a model plus ports, state and a rate."""

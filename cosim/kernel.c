@@ -157,7 +157,7 @@ static void draw_uniforms(uint64_t key, int64_t step, const uint32_t *members, i
 
 /* ------------------------------------------------------------------------------ the driver -- */
 
-/* What a call works on; laid out as `_structure` of cosim/kernels.py. Strides in doubles. */
+/* What a call works on; laid out as `_structure` of cosim/kernel_compiled.py. Strides in doubles. */
 struct binding {
     int64_t step;
     int64_t n_members;

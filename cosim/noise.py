@@ -146,7 +146,7 @@ def _ratio(polynomials: tuple[Sequence[float], Sequence[float]], x: FloatArray) 
 
 
 def _log(x: FloatArray) -> FloatArray:
-    """Natural logarithm of positive normal numbers, to one unit in the last place."""
+    """Natural logarithm of positive normal numbers, to one unit in the last place [3]_."""
     bits = x.view(np.uint64) + np.uint64(0x3FF0000000000000 - 0x3FE6A09E00000000)
     exponent = (bits >> np.uint64(52) | np.uint64(0x4330000000000000)).view(np.float64)
     k = exponent - (2.0**52 + 1023)
@@ -155,14 +155,13 @@ def _log(x: FloatArray) -> FloatArray:
     s = f / (2 + f)
     z = s * s
     w = z * z
-    odd = w * (3.999999999940941908e-1 + w * (2.222219843214978396e-1 + w * 1.531383769920937332e-1))
+    odd = w * (
+        3.999999999940941908e-1 + w * (2.222219843214978396e-1 + w * 1.531383769920937332e-1)
+    )
     even = z * (
         6.666666666666735130e-1
         + w
-        * (
-            2.857142874366239149e-1
-            + w * (1.818357216161805012e-1 + w * 1.479819860511658591e-1)
-        )
+        * (2.857142874366239149e-1 + w * (1.818357216161805012e-1 + w * 1.479819860511658591e-1))
     )
     half = 0.5 * f * f
     low = s * (half + (even + odd)) + k * 1.90821492927058770002e-10
@@ -174,8 +173,8 @@ def normal_quantile(u: ArrayLike) -> FloatArray:
 
     AS 241 (PPND16): about one part in 10\ :sup:`16`, and the same bits as ``kernel.c``.
     """
-    u = np.ascontiguousarray(u, dtype=np.float64)
-    shape, u = u.shape, u.reshape(-1)
+    u = np.asarray(u, dtype=np.float64)
+    shape, u = u.shape, u.ravel()
     q = u - 0.5
     z = q * _ratio(_CENTER, 0.180625 - q * q)
     tail = np.flatnonzero(np.abs(q) > 0.425)
@@ -235,11 +234,13 @@ class NormalStream:
 
     def uniform(self, step: int, n: int) -> FloatArray:
         """Uniform numbers in (0, 1) of one step, shape (n_members, n)."""
-        return self.uniform_at([step], n)[0]
+        numbers: FloatArray = self.uniform_at([step], n)[0]
+        return numbers
 
     def draw(self, step: int, n: int) -> FloatArray:
         """Standard normals of one step, shape (n_members, n)."""
-        return self.draw_at([step], n)[0]
+        numbers: FloatArray = self.draw_at([step], n)[0]
+        return numbers
 
     def block(self, first_step: int, n_steps: int, n: int) -> FloatArray:
         """Standard normals of consecutive steps, shape (n_steps, n_members, n)."""

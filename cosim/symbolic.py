@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.buffers import BundleView, MessageReader, MessageWriter
 from terrafix.cosim.component import Component, Environment
 from terrafix.cosim.errors import ConfigurationError, nearest
-from terrafix.cosim.kernels import Argument, BoundKernel, Kernel, Result
+from terrafix.cosim.kernels import Argument, BoundKernel, Kernel, Result, Specification
 from terrafix.cosim.noise import stream_key
 from terrafix.cosim.parameters import Parameter
 from terrafix.cosim.ports import Capabilities
@@ -134,7 +134,7 @@ class SymbolicComponent(Component):
 
     # ------------------------------------------------------------------ kernels
 
-    def kernel_request(self) -> tuple[Any, list[Argument], list[Result]]:
+    def kernel_request(self) -> Specification:
         """What to build the step kernel from: function, arguments, results."""
         model = self.model
 
@@ -151,7 +151,7 @@ class SymbolicComponent(Component):
             arguments.append(Argument("time", 1, "shared"))
         results = [Result(n, size(n)) for n in model.outputs]
         results += [Result(f"state:{n}", size(n)) for n in model.states]
-        return model.step_function(), arguments, results
+        return Specification(model.step_function(), arguments, results)
 
     def bind(self, environment: Environment) -> None:
         """Get arrays for states and parameters."""

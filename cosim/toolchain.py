@@ -14,6 +14,7 @@ that build the same library at the same time do not disturb one another.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
 import functools
 import importlib.util
@@ -26,10 +27,11 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from typing import Protocol
 
 from terrafix.cosim.errors import ConfigurationError, TerrafixError
 
@@ -134,12 +136,22 @@ def find_compiler() -> Compiler | None:
     return None
 
 
-def describe() -> str:
-    """Say in one line for the user which compiler serves, or why none does."""
+class _Kernel(Protocol):
+    note: str
+
+
+def describe(kernels: Iterable[_Kernel] = ()) -> str:
+    """Say in one line for the user what serves, and why it is not better.
+
+    A compiler's defect shows when it is first used: describe kernels after they are built. Those
+    of `kernels` that were refused by a compiler that otherwise works are named.
+    """
     compiler = find_compiler()
-    if compiler:
-        return f"kernels: {compiler.name}, plain C"
-    return f"kernels: CasADi virtual machine ({_why_none()})"
+    if compiler is None:
+        return f"kernels: CasADi virtual machine ({_why_none()})"
+    refused = [kernel.note for kernel in kernels if kernel.note]
+    rest = f"; CasADi virtual machine for {', '.join(refused)}" if refused else ""
+    return f"kernels: {compiler.name}, plain C{rest}"
 
 
 def compilation_required() -> bool:
@@ -311,10 +323,8 @@ def _open_kept(path: Path, key: str) -> ctypes.CDLL | None:
                 return library
     except (OSError, ValueError):
         pass  # unreadable, not a library of this machine, or without a key
-    try:
+    with contextlib.suppress(OSError):  # read-only, in use, or already removed by another process
         path.unlink()
-    except OSError:
-        pass  # read-only, in use, or already removed by another process
     return None
 
 

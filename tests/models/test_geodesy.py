@@ -21,7 +21,7 @@ HEIGHTS = [-11_000.0, 0.0, 700_000.0, 36_000_000.0]  # [m]: trench, ellipsoid, l
 
 @pytest.mark.parametrize("height", HEIGHTS)
 def test_round_trip_from_pole_to_pole(height):
-    """1e-9 m is the spacing of floats at the Earth's radius, and grows with it."""
+    """Accurate to some roundings: floats are 1e-9 m apart at the Earth's radius."""
     latitude = np.radians(np.r_[np.linspace(-90, 90, 181), 89.9999999, 1e-9, -45.0])
     longitude = np.radians(np.linspace(-179.9, 180, latitude.size))
     r_e = ecef_from_geodetic_array(latitude, longitude, height)
@@ -32,7 +32,7 @@ def test_round_trip_from_pole_to_pole(height):
     inside = np.abs(latitude) < np.radians(89.99)
     np.testing.assert_allclose(lon[inside], longitude[inside], atol=1e-12)
     again = ecef_from_geodetic_array(lat, lon, h)
-    assert np.all(np.linalg.norm(again - r_e, axis=-1) <= np.maximum(1e-9, 4 * spacing))
+    assert np.all(np.linalg.norm(again - r_e, axis=-1) <= 8 * spacing)
 
 
 def test_forward_agrees_with_pymap3d():
@@ -110,6 +110,6 @@ def test_point_is_continuous_at_the_limb():
             [height, 0, 0], [-np.cos(angle), np.sin(angle), 0]
         )
         assert hit == expected
-        # 1e-9 rad beside the limb the two roots lie sqrt(2 R d / tan) = 130 m from the tangent
+        # 1e-9 rad is 2.9 mm at the limb; the root lies sqrt(2 R 2.9 mm) = 192 m before it
         tangent = EARTH.radius * np.array([np.sin(grazing), np.cos(grazing), 0])
         assert np.linalg.norm(point - tangent) < 200

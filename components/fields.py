@@ -1,0 +1,50 @@
+"""Fields that several components share: an estimate, a fix, an innovation, a known state."""
+
+from __future__ import annotations
+
+from terrafix.cosim.ports import Field
+
+STATE_AXES = (
+    *("r_x", "r_y", "r_z"),
+    *("v_x", "v_y", "v_z"),
+    *("mu_x", "mu_y", "mu_z"),
+)
+MEASURED = ("tan_azimuth", "tan_elevation", "slant_range", "in_track_velocity")
+MEASURED_UNITS = ("1", "1", "m", "m/s")
+XYZ = ("x", "y", "z")
+
+KNOWN_STATE = {
+    "r_e": Field((3,), "m", "e", labels=XYZ, doc="position"),
+    "v_e": Field((3,), "m/s", "e", labels=XYZ, doc="velocity relative to the Earth"),
+    "P": Field((6, 6), "1", doc="covariance of position [m] and velocity [m/s]"),
+}
+"""A position and velocity known with a covariance."""
+
+ESTIMATE = {
+    "r_e": Field((3,), "m", "e", labels=XYZ, doc="position"),
+    "v_e": Field((3,), "m/s", "e", labels=XYZ, doc="velocity relative to the Earth"),
+    "q_mu": Field((4,), "1", "s", doc="antenna misalignment, nominal to true antenna frame"),
+    "P": Field(
+        (9, 9), "1", doc="covariance of position [m], velocity [m/s] and misalignment [rad] error"
+    ),
+}
+"""What the spacecraft filter knows."""
+
+FIX = {
+    "y": Field((4,), MEASURED_UNITS, labels=MEASURED, doc="measured elements"),
+    "r_f_e": Field((3,), "m", "e", labels=XYZ, doc="geocoded center pixel"),
+    "R": Field((4, 4), "1", doc="covariance of the noise of y, in its units"),
+    "D": Field((3, 3), "m^2", "e", doc="covariance of the geocoding error of r_f_e"),
+    "present": Field((4,), "1", labels=MEASURED, doc="1 where an element was measured, else 0"),
+}
+"""A fix from one SAR image: up to four elements and the ground point they refer to."""
+
+INNOVATION = {
+    "residual": Field((4,), MEASURED_UNITS, labels=MEASURED, doc="measured minus predicted"),
+    "sigma": Field((4,), MEASURED_UNITS, labels=MEASURED, doc="predicted, not underweighted"),
+    "nis": Field((), "1", doc="normalized innovation squared, not underweighted"),
+    "dof": Field((), "1", doc="number of elements used"),
+    "accepted": Field((), "1", doc="1 if the fix corrected the estimate, else 0"),
+    "reason": Field((), "1", doc="index into terrafix.models.mekf.REASONS"),
+}
+"""What a correction says about the fix it was given."""
