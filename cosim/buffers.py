@@ -158,7 +158,7 @@ class MessageWriter:
 
     def __init__(self, port: Port[Any], n_members: int, active: Mask) -> None:
         self.slot = MessageSlot(port.fields, n_members)
-        self._ragged = any(f.ragged for f in port.fields.values())
+        self._capacity = max((f.fixed_shape[0] for f in port.fields.values() if f.ragged), default=0)
         self._name = port.name
         self._active = active
         self._draft: MessageSlot | None = None
@@ -212,10 +212,17 @@ class MessageWriter:
             )
         for name, each in given.items():
             draft[name][...] = each
-        if self._ragged:
+        if self._capacity:
             if count is None:
                 raise ValueError(f"message '{self._name}' is ragged; give its count")
-            np.copyto(self.slot.count, np.asarray(count, dtype=np.int64), where=mask)
+            counts = np.broadcast_to(np.asarray(count, dtype=np.int64), mask.shape)
+            outside = mask & ((counts < 0) | (counts > self._capacity))
+            if outside.any():
+                raise ValueError(
+                    f"message '{self._name}' holds up to {self._capacity}, its count is "
+                    f"{counts[outside][0]}"
+                )
+            np.copyto(self.slot.count, counts, where=mask)
         assert self._draft is not None
         self._commit(t, mask, self._draft.data)
 
@@ -251,18 +258,20 @@ class MessageReader:
         ``valid`` (n_members,) and its fields.
     """
 
-    def __init__(self, port: Port[Any], slot: MessageSlot) -> None:
-        self._name = port.name
+    def __init__(self, port: Port[Any], slot: MessageSlot, *, at_zero: bool = True) -> None:
         self.depth = port.queue
         self.slot = slot
+        self._at_zero = at_zero
         self.fresh: Mask = np.zeros(len(slot.t), dtype=np.bool_)
         self.fresh_number = np.zeros(len(slot.t))  # the same for kernels: 0.0 or 1.0
         self.overruns = 0
         self._seen = np.zeros(len(slot.t), dtype=np.int64)
         self._version = 0
         self._collected = 0
+        self._last_collected = np.zeros(len(slot.t), dtype=np.int64)
         self._any_fresh = False
         self._waiting: list[Saved] = []
+        self._released: list[Saved] | None = None
         self.queued: list[Saved] = []
         self._fields = {name: _read_only(view) for name, view in slot.views.items()}
         self.t = _read_only(slot.t)
@@ -281,15 +290,13 @@ class MessageReader:
             return view
         raise AttributeError(f"there is no field '{name}'; the fields are {sorted(fields)}")
 
-    def collect(self) -> None:
-        """Keep a copy of what was just published (queues deeper than one)."""
-        slot = self.slot
+    def collect(self, slot: MessageSlot) -> None:
+        """Keep a copy of what was just published to `slot` (queues deeper than one)."""
         if slot.version == self._collected:
             return
         self._collected = slot.version
-        valid = slot.sequence > self._seen
-        for earlier in self._waiting:
-            valid &= slot.sequence > earlier["sequence"]
+        valid = slot.sequence > self._last_collected
+        self._last_collected[:] = slot.sequence
         record: Saved = {"valid": valid, "t": slot.t.copy(), "sequence": slot.sequence.copy()}
         record |= {name or "value": view.copy() for name, view in slot.views.items()}
         record["count"] = slot.count.copy()
@@ -297,8 +304,18 @@ class MessageReader:
         if len(self._waiting) > self.depth:
             self.overruns += int(self._waiting.pop(0)["valid"].sum())
 
-    def refresh(self) -> None:
-        """Before the component steps: find out what is new."""
+    def release(self) -> None:
+        """Let the next step see what waits now, and nothing later (queues read at the start)."""
+        self._released, self._waiting = self._waiting, []
+
+    def refresh(self, tick: int) -> None:
+        """Before the component steps: find out what is new.
+
+        At t = 0 this is so for components that step or publish then; for others, messages stay
+        unread until their first step.
+        """
+        if tick == 0 and not self._at_zero:
+            return
         slot = self.slot
         if slot.version == self._version:
             if self._any_fresh:
@@ -312,8 +329,10 @@ class MessageReader:
         if self.depth == 1:
             unread = slot.sequence - self._seen - 1
             self.overruns += int(unread[unread > 0].sum())
-        else:
+        elif self._released is None:
             self.queued, self._waiting = self._waiting, []
+        else:
+            self.queued, self._released = self._released, []
         self._seen[:] = slot.sequence
         self._version = slot.version
         self._any_fresh = True
@@ -325,8 +344,10 @@ class MessageReader:
             "seen": self._seen.copy(),
             "version": self._version,
             "collected": self._collected,
+            "last_collected": self._last_collected.copy(),
             "overruns": self.overruns,
             "waiting": [dict(record) for record in self._waiting],
+            "released": self._released and [dict(record) for record in self._released],
         }
 
     def set_state(self, saved: Saved) -> None:
@@ -337,8 +358,10 @@ class MessageReader:
         _restore(self._seen, saved["seen"])
         self._version = int(saved["version"])
         self._collected = int(saved["collected"])
+        _restore(self._last_collected, saved["last_collected"])
         self.overruns = int(saved["overruns"])
         self._waiting = [dict(record) for record in saved["waiting"]]
+        self._released = saved["released"] and [dict(record) for record in saved["released"]]
 
 
 class WindowView:
@@ -430,6 +453,10 @@ class SharedSlot:
             )
         self.value = _read_only(array)
         self.version += 1
+
+    def refer_to(self, other: SharedSlot) -> None:
+        """Hold what another slot holds now."""
+        self.value, self.version = other.value, other.version
 
     def get_state(self) -> Saved:
         """Arrays that reproduce the slot."""

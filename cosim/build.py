@@ -24,7 +24,14 @@ from terrafix.cosim.buffers import (
 from terrafix.cosim.check import Plan
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component, Environment
-from terrafix.cosim.links import CopyMessage, CopySignal, DelayLine, Transfer, default_slot
+from terrafix.cosim.links import (
+    CopyMessage,
+    CopyShared,
+    CopySignal,
+    DelayLine,
+    Transfer,
+    default_slot,
+)
 from terrafix.cosim.ports import Port
 from terrafix.cosim.system import Connection
 from terrafix.cosim.wiring import port_factor
@@ -145,22 +152,32 @@ def _connect(
 ) -> None:
     path, source_path = connection.target.rpartition(".")[0], plan.flat.owner(connection.source)
     slot = wiring.slots[connection.source]
+    in_place = _reads_in_place(
+        place[path], place[source_path], component.rate, plan.flat.components[source_path].rate
+    )
     if isinstance(slot, SharedSlot):
+        if port.at == "start" and not in_place:
+            held = SharedSlot(port.single, name)
+            wiring.latch[path].append(CopyShared(slot, held))
+            wiring.keepers[f"copy:{connection.target}"] = slot = held
         component._views[name] = slot
         return
     source_port = plan.flat.port(connection.source)
     factor = port_factor(source_port, port)
-    source_rate, rate = plan.flat.components[source_path].rate, component.rate
-    assert source_rate is not None
-    assert rate is not None
     if port.window:
-        capacity = _window_capacity(source_rate, rate)
+        source = plan.flat.components[source_path]
+        capacity = _window_capacity(source.rate, component.rate)
         window = WindowView(slot.views[""], capacity, factor)
         component._views[name] = wiring.keepers[f"window:{connection.target}"] = window
-        wiring.after[source_path].append(lambda tick, t: window.collect(t))  # noqa: ARG005
+        wiring.after[source_path].append(
+            lambda tick, t: window.collect(source.scheduled(t))  # noqa: ARG005
+        )
         wiring.clear[path].append(window.clear)
         return
-    in_place = _reads_in_place(place[path], place[source_path], rate, source_rate)
+    if port.queue > 1:
+        assert isinstance(slot, MessageSlot)
+        _connect_queue(plan, wiring, connection, component, name, port, slot, factor, in_place)
+        return
     if connection.delay:
         private = type(slot)(source_port.fields, len(slot.data))
         line = DelayLine(slot, private, factor, int(connection.delay / plan.base))
@@ -177,14 +194,70 @@ def _connect(
         wiring.before[path].append(_copy(slot, private, factor))
         slot = _keep(wiring, connection, private)
     if isinstance(slot, MessageSlot):
-        reader = MessageReader(port, slot)
-        component._views[name] = wiring.readers[connection.target] = reader
-        wiring.keepers[f"reader:{connection.target}"] = reader
-        wiring.before[path].append(_Refresh(reader))
-        if port.queue > 1:
-            wiring.after[source_path].append(_Collect(reader))
+        _read_message(wiring, connection, component, name, port, slot)
     else:
         component._views[name] = _signal_view(port, slot)
+
+
+def _read_message(
+    wiring: Wiring,
+    connection: Connection,
+    component: Component,
+    name: str,
+    port: Port[Any],
+    slot: MessageSlot,
+) -> MessageReader:
+    reader = MessageReader(port, slot, at_zero=component.takes_messages_at_start)
+    component._views[name] = wiring.readers[connection.target] = reader
+    wiring.keepers[f"reader:{connection.target}"] = reader
+    wiring.before[connection.target.rpartition(".")[0]].append(reader.refresh)
+    return reader
+
+
+def _connect_queue(
+    plan: Plan,
+    wiring: Wiring,
+    connection: Connection,
+    component: Component,
+    name: str,
+    port: Port[Any],
+    slot: MessageSlot,
+    factor: NDArray[np.float64] | None,
+    in_place: bool,
+) -> None:
+    """Tie a queue to its source: every message is kept as soon as it is published or arrives.
+
+    What the reader shows of the last message follows the queue; read at the start of a step,
+    both stand still from the end of the step before.
+    """
+    path, source_path = connection.target.rpartition(".")[0], plan.flat.owner(connection.source)
+    source, fields = slot, plan.flat.port(connection.source).fields
+    latched = port.at == "start" and bool(connection.delay or not in_place)
+    n_members = len(source.data)
+    if factor is not None or connection.delay:
+        slot = MessageSlot(fields, n_members)
+        wiring.keepers[f"queue:{connection.target}"] = slot
+    shown = slot
+    if latched:
+        shown = MessageSlot(fields, n_members)
+        wiring.keepers[f"copy:{connection.target}"] = shown
+    if connection.delay:
+        line = DelayLine(source, slot, factor, int(connection.delay / plan.base))
+        wiring.keepers[f"delay:{connection.target}"] = line
+        wiring.after[source_path].append(lambda tick, t: line.collect(tick))  # noqa: ARG005
+        (wiring.latch if latched else wiring.before)[path].append(line)
+    elif factor is not None:
+        copy = CopyMessage(source, slot, factor)
+        wiring.after[source_path].append(lambda tick, t: copy(tick))  # noqa: ARG005
+    if latched:
+        wiring.latch[path].append(CopyMessage(slot, shown, None))
+    reader = _read_message(wiring, connection, component, name, port, shown)
+    if connection.delay:
+        line.arrived = reader.collect
+    else:
+        wiring.after[source_path].append(lambda tick, t: reader.collect(slot))  # noqa: ARG005
+    if latched:
+        wiring.latch[path].append(lambda tick: reader.release())  # noqa: ARG005
 
 
 def _keep(wiring: Wiring, connection: Connection, private: SignalSlot) -> SignalSlot:
@@ -198,46 +271,29 @@ def _copy(source: SignalSlot, target: SignalSlot, factor: NDArray[np.float64] | 
     return CopySignal(source, target, factor)
 
 
-class _Refresh:
-    """Tell a reader, before its component steps, to look for what is new."""
-
-    def __init__(self, reader: MessageReader) -> None:
-        self.reader = reader
-
-    def __call__(self, tick: int) -> None:  # noqa: ARG002 - the moment does not matter
-        self.reader.refresh()
-
-
-class _Collect:
-    """Queue a message for a reader when it is published."""
-
-    def __init__(self, reader: MessageReader) -> None:
-        self.reader = reader
-
-    def __call__(self, tick: int, t: float) -> None:  # noqa: ARG002 - the moment does not matter
-        self.reader.collect()
-
-
-def _window_capacity(source: Rate, consumer: Rate) -> int:
+def _window_capacity(source: Rate | None, consumer: Rate | None) -> int:
     """Samples expected in a window; it grows if more come."""
-    if source.period is None or consumer.period is None:
+    if source is None or source.period is None or consumer is None or consumer.period is None:
         return 16
     longest = max(consumer.period, consumer.offset)
     return math.ceil(longest / source.period) + 1
 
 
-def _reads_in_place(place: int, source_place: int, rate: Rate, source: Rate) -> bool:
+def _reads_in_place(
+    place: int, source_place: int, rate: Rate | None, source: Rate | None
+) -> bool:
     """Whether a start-read may look at the source's memory when its component steps.
 
     It may if the source has not stepped since the start of the consumer's step: it steps after
     the consumer within a tick, and only at ticks at which the consumer steps too.
     """
-    if place >= source_place or rate.period is None:
+    if place >= source_place or rate is None or rate.period is None:
         return False
 
     def on_grid(time: Fraction) -> bool:
         return time >= rate.offset and (time - rate.offset) % rate.period == 0  # type: ignore[operator]
 
+    assert source is not None
     if source.times is not None:
         return all(on_grid(t) for t in source.times if t)
     assert source.period is not None

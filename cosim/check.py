@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
+import numpy as np
 from terrafix.cosim.clock import Rate, base_step, text_seconds
 from terrafix.cosim.errors import (
     ConfigurationError,
@@ -31,6 +32,9 @@ class Plan:
         Component paths in stepping order.
     base : Fraction
         Base step [s].
+    grid : Fraction
+        What listed times are snapped to [s]: the base step of the components alone, so that a
+        recorder moves nobody.
     notes : list of str
         What is allowed but worth knowing.
     """
@@ -38,6 +42,7 @@ class Plan:
     flat: FlatSystem
     order: list[str]
     base: Fraction
+    grid: Fraction
     notes: list[str]
 
 
@@ -83,8 +88,9 @@ def check(system: System) -> Plan:
                 attempt(lambda f=field: _check_units(f))  # type: ignore[misc]
     problems.extend(_unconnected(flat))
     problems.extend(_two_drivers(flat))
-    base = _base(flat)
-    problems.extend(_too_fast(flat, base))
+    base, grid = _steps(flat)
+    problems.extend(_too_fast(flat, grid))
+    problems.extend(_same_records(flat))
     for record in flat.records:
         attempt(lambda r=record: record_rate(flat, r))  # type: ignore[misc]
     for dispersion in flat.dispersions:
@@ -97,7 +103,7 @@ def check(system: System) -> Plan:
     attempt(find_order)
     if problems:
         raise SystemCheckError(system.name, problems)
-    return Plan(flat, order, base, list(_notes(flat)))
+    return Plan(flat, order, base, grid, list(_notes(flat)))
 
 
 def _check_units(field: Field) -> None:
@@ -151,32 +157,38 @@ def _two_drivers(flat: FlatSystem) -> Iterator[TerrafixError]:
         drivers[connection.target] = connection.source
 
 
-def _rates(flat: FlatSystem) -> list[Rate]:
-    rates = [c.rate for c in flat.components.values() if c.rate is not None]
-    return rates + [r.rate for r in flat.records if r.rate is not None]
-
-
-def _base(flat: FlatSystem) -> Fraction:
-    rates = _rates(flat)
-    numbers = [n for rate in rates for n in rate.exact_numbers]
+def _steps(flat: FlatSystem) -> tuple[Fraction, Fraction]:
+    """Base step of everything, and of the components alone (to which listed times are snapped)."""
+    own = [c.rate for c in flat.components.values() if c.rate is not None]
+    observing = [r.rate for r in flat.records if r.rate is not None]
+    numbers = [n for rate in own for n in rate.exact_numbers]
     numbers += [c.delay for c in flat.connections]
-    listed = [t for rate in rates for t in rate.times or ()]
-    return base_step(numbers, listed)
+    grid = base_step(numbers, [t for rate in own for t in rate.times or ()])
+    return base_step([grid, *(n for rate in observing for n in rate.exact_numbers)]), grid
 
 
-def _too_fast(flat: FlatSystem, base: Fraction) -> Iterator[TerrafixError]:
-    for path, component in flat.components.items():
-        rate = component.rate
+def _too_fast(flat: FlatSystem, grid: Fraction) -> Iterator[TerrafixError]:
+    timed = [(f"'{path}'", component.rate) for path, component in flat.components.items()]
+    timed += [(f"record '{record.name}'", record.rate) for record in flat.records]
+    for what, rate in timed:
         if rate is None or rate.times is None:
             continue
         for early, late in zip(rate.times, rate.times[1:], strict=False):
-            if late - early < base:
+            if late - early < grid:
                 yield RateError(
-                    f"'{path}' has the times {text_seconds(early)} s and {text_seconds(late)} s, "
-                    f"closer than the base step of {text_seconds(base)} s\n"
+                    f"{what} has the times {text_seconds(early)} s and {text_seconds(late)} s, "
+                    f"closer than the base step of {text_seconds(grid)} s\n"
                     "  leave one out, or give another component a finer period"
                 )
                 break
+
+
+def _same_records(flat: FlatSystem) -> Iterator[TerrafixError]:
+    names = [record.name for record in flat.records]
+    for name in sorted({n for n in names if names.count(n) > 1}):
+        yield ConfigurationError(
+            f"two records are called '{name}', one of them in a nested system\n  rename one"
+        )
 
 
 def record_rate(flat: FlatSystem, record: Record) -> Rate:
@@ -195,6 +207,12 @@ def record_rate(flat: FlatSystem, record: Record) -> Rate:
         if port.is_input:
             raise WiringError(
                 f"record '{record.name}' names the input '{path}'; record the output that feeds it"
+            )
+        strange = [f.dtype for f in port.fields.values() if np.dtype(f.dtype).kind not in "fiub"]
+        if strange:
+            raise WiringError(
+                f"record '{record.name}' names '{path}' of {np.dtype(strange[0])}; "
+                "records hold real numbers: publish real and imaginary parts"
             )
         if port.kind == "shared":
             raise WiringError(f"record '{record.name}' names the shared port '{path}'; it may not")

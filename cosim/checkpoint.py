@@ -7,7 +7,6 @@ a system, a seed and an ensemble, and says so.
 from __future__ import annotations
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ SCHEMA = "terrafix-checkpoint/1"
 
 
 def _pack(value: Any, arrays: dict[str, Any]) -> Any:
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         key = f"a{len(arrays)}"
         arrays[key] = value
         return {"__array__": key}
@@ -31,7 +30,11 @@ def _pack(value: Any, arrays: dict[str, Any]) -> Any:
         return value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise CheckpointError(f"a state of type {type(value).__name__} cannot be saved")
+    kind = f"{value.dtype} array" if isinstance(value, np.ndarray) else type(value).__name__
+    raise CheckpointError(
+        f"a state of type {kind} cannot be saved\n"
+        "  give numbers, texts, lists, dicts and arrays of numbers"
+    )
 
 
 def _unpack(value: Any, arrays: Any) -> Any:
@@ -68,7 +71,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         with np.load(path, allow_pickle=False) as stored:
             tree = json.loads(bytes(stored["tree"]))
             arrays = {k: stored[k] for k in stored.files if k != "tree"}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
+    except Exception as error:  # a damaged file may fail in any way
         raise CheckpointError(
             f"'{path}' is damaged or no checkpoint: {error}\n  start the run again without --resume"
         ) from error

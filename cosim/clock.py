@@ -86,8 +86,10 @@ def text_seconds(value: Fraction) -> str:
         denominator //= 2
     while denominator % 5 == 0:
         denominator //= 5
-    if denominator == 1 and abs(value) < 10**15:
-        return f"{Decimal(value.numerator) / Decimal(value.denominator):f}"
+    if denominator == 1:
+        decimal = Decimal(value.numerator) / Decimal(value.denominator)
+        if Fraction(decimal) == value:  # not longer than the 28 digits of a Decimal
+            return f"{decimal:f}"
     return f"{value.numerator}/{value.denominator}"
 
 
@@ -184,34 +186,48 @@ class Rate:
         """The numbers that the base step must divide. Listed times are snapped instead."""
         return () if self.period is None else (self.period, self.offset)
 
-    def ticks(self, base: Fraction) -> Iterator[tuple[int, Fraction]]:
-        """Yield (tick, exact time) of each activation after t = 0.
+    def ticks(self, base: Fraction, grid: Fraction | None = None, after: int = 0) -> Iterator[int]:
+        """Yield the tick of each activation after the tick `after`.
 
-        A time between two ticks is snapped to the later one: the data exist by then.
+        Parameters
+        ----------
+        base : Fraction
+            Length of a tick [s]; divides `exact_numbers`.
+        grid : Fraction, optional
+            A multiple of `base` to which listed times are snapped [s]; `base` if absent. A time
+            between two points goes to the later one: the data exist by then.
+        after : int
+            Where to begin; activations at t = 0 are initialization.
         """
         if self.times is not None:
-            last = 0
-            for time in self.times:
-                tick = max(math.ceil(time / base), last + 1) if time else 0
-                if tick > 0:
-                    yield tick, time
-                    last = tick
+            yield from (tick for tick in self._snapped(base, grid) if tick > after)
             return
-        assert self.period is not None
-        step, first = self.period / base, self.offset / base
-        if step.denominator == 1 and first.denominator == 1:  # plain integers: the usual case
-            increment, tick, k = step.numerator, first.numerator, 0
-            if tick == 0:
-                tick, k = increment, 1
-            while True:
-                yield tick, self.offset + k * self.period
-                tick += increment
-                k += 1
-        k = 0 if self.offset else 1
+        tick, increment = self._regular(base)
+        if tick <= after:
+            tick += ((after - tick) // increment + 1) * increment
         while True:
-            time = self.offset + k * self.period
-            yield math.ceil(time / base), time
-            k += 1
+            yield tick
+            tick += increment
+
+    def last_tick(self, base: Fraction, grid: Fraction | None, tick: int) -> int:
+        """Tick of the last activation up to and including `tick`; 0 if there is none."""
+        if self.times is not None:
+            return max((t for t in self._snapped(base, grid) if t <= tick), default=0)
+        first, increment = self._regular(base)
+        return tick - (tick - first) % increment if tick >= first else 0
+
+    def _regular(self, base: Fraction) -> tuple[int, int]:
+        """First activation and increment, in ticks."""
+        assert self.period is not None
+        first, increment = self.offset / base, self.period / base
+        assert first.denominator == increment.denominator == 1
+        return first.numerator, increment.numerator
+
+    def _snapped(self, base: Fraction, grid: Fraction | None) -> list[int]:
+        assert self.times is not None
+        grid = grid or base
+        ticks_per_point = int(grid / base)
+        return [math.ceil(time / grid) * ticks_per_point for time in self.times]
 
     def __str__(self) -> str:
         if self.times is not None:

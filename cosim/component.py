@@ -27,7 +27,17 @@ from terrafix.cosim.ports import Capabilities, Declaration, Port, State
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-RESERVED = frozenset({"type", "rate", "period", "offset", "times", "name", "doc", "file"})
+RESERVED = frozenset(
+    {
+        *("type", "rate", "period", "offset", "times", "name", "doc", "file"),  # in system files
+        *("ports", "step_index", "kernel"),  # attributes of every component
+    }
+)
+
+
+def _own(base: type) -> bool:
+    """Whether a base class is the contract itself, whose attributes no declaration may hide."""
+    return base.__module__ in ("terrafix.cosim.component", "terrafix.cosim.symbolic")
 
 
 @dataclass(frozen=True)
@@ -101,6 +111,7 @@ class Component:
                 elif name in declared:
                     del declared[name]  # a subclass took the name for something else
         clash = (set(declared) & RESERVED) | {n for n in declared if n.startswith("_")}
+        clash |= {n for n in declared for base in cls.__mro__ if n in vars(base) and _own(base)}
         if clash:
             raise TypeError(f"{cls.__name__} declares reserved names {sorted(clash)}")
         cls._declared = declared
@@ -228,6 +239,25 @@ class Component:
     def publishes_at_start(self) -> bool:
         """Whether messages may be published at t = 0: whether 0 is one of the activations."""
         return self.rate is not None and self.rate.starts_at_zero
+
+    @property
+    def takes_messages_at_start(self) -> bool:
+        """Whether messages of t = 0 are read at initialization, rather than by the first step.
+
+        They are where 0 is one of the activations and the component does something then.
+        """
+        acts = type(self)._initialize_impl is not Component._initialize_impl
+        return acts and self.publishes_at_start
+
+    def scheduled(self, t: float) -> float:
+        """The time of this activation as it was listed, before it was snapped to a tick at `t` [s].
+
+        For the time of validity of what a component with listed times publishes; `t` itself where
+        a period is the schedule.
+        """
+        if self.rate is None or self.rate.times is None or self.step_index == 0:
+            return t
+        return float(self.rate.times[self.step_index - (not self.rate.starts_at_zero)])
 
     def initialize(self) -> None:
         """Publish outputs at t = 0."""

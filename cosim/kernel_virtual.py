@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from terrafix.cosim.kernel_base import BoundArrays, BoundKernel, Kernel
 from terrafix.cosim.noise import NormalBlocks, NormalStream
 
@@ -43,9 +44,9 @@ class _VirtualMachineBinding(BoundKernel):
             buffer, evaluate = kernel.function.buffer()
             for i, argument in enumerate(kernel.arguments):
                 row = 0 if argument.kind == "shared" else member
-                buffer.set_arg(i, memoryview(rows[argument.name][row]))
+                buffer.set_arg(i, rows[argument.name][row].data)
             for i, columns in enumerate(self._columns):
-                buffer.set_res(i, memoryview(self._next[member, columns]))
+                buffer.set_res(i, self._next[member, columns].data)
             self._buffers.append(buffer)
             self._evaluations.append(evaluate)
 
@@ -56,7 +57,7 @@ class _VirtualMachineBinding(BoundKernel):
         self._next.fill(np.nan)  # stands where nothing is computed: inactive members, failures
         for member in chosen.nonzero()[0].tolist():
             self._evaluations[member]()
-        good = np.isfinite(self._next).all(axis=1)
+        good: NDArray[np.bool_] = np.all(np.isfinite(self._next), axis=1)
         for target, source in self._copies:
             np.copyto(target, source, where=good[:, None])
         bad = chosen & ~good

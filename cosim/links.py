@@ -7,11 +7,12 @@ consumer's interval begins (an input read at the start of the step).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from terrafix.cosim.buffers import MessageSlot, Saved, SignalSlot
+from terrafix.cosim.buffers import MessageSlot, Saved, SharedSlot, SignalSlot
 
 FloatArray = NDArray[np.float64]
 
@@ -49,11 +50,22 @@ class CopyMessage:
             self.target.copy_from(self.source, self.factor)
 
 
+class CopyShared:
+    """Hand a shared value on by reference."""
+
+    def __init__(self, source: SharedSlot, target: SharedSlot) -> None:
+        self.source, self.target = source, target
+
+    def __call__(self, tick: int) -> None:  # noqa: ARG002 - the moment does not matter
+        """Hand on."""
+        self.target.refer_to(self.source)
+
+
 class DelayLine:
     """Values published at a tick, handed on a fixed number of ticks later.
 
     Until the delay has passed, a signal holds what was published at t = 0; a message has not
-    arrived.
+    arrived. `arrived`, if given, is called with the target for each message that is handed on.
     """
 
     def __init__(
@@ -62,9 +74,11 @@ class DelayLine:
         target: SignalSlot,
         factor: FloatArray | None,
         delay: int,
+        arrived: Callable[[Any], None] | None = None,
     ) -> None:
         self.source, self.target = source, target
         self.factor, self.delay = factor, delay
+        self.arrived = arrived
         self._waiting: list[tuple[int, Saved]] = []
         self._started = False
         self._version = 0
@@ -87,6 +101,8 @@ class DelayLine:
             self.target.set_state(self._waiting.pop(0)[1])
             if self.factor is not None:
                 self.target.data *= self.factor
+            if self.arrived is not None:
+                self.arrived(self.target)
 
     def get_state(self) -> Saved:
         """Arrays that reproduce the line."""

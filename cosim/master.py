@@ -18,8 +18,8 @@ from terrafix.cosim.build import Wiring, bind_components, connect_ports
 from terrafix.cosim.check import Plan
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component
-from terrafix.cosim.errors import StepError, TerrafixError
-from terrafix.cosim.links import Transfer
+from terrafix.cosim.errors import ConfigurationError, StepError, TerrafixError
+from terrafix.cosim.links import DelayLine, Transfer
 
 Mask = NDArray[np.bool_]
 
@@ -27,32 +27,27 @@ Mask = NDArray[np.bool_]
 class _Group:
     """Components (or one recorder) that step at the same ticks."""
 
-    def __init__(self, rate: Rate, base: Fraction) -> None:
+    def __init__(self, rate: Rate, plan: Plan) -> None:
         self.rate = rate
-        self.base = base
+        self._base, self._grid = plan.base, plan.grid
+        self._numerator, self._denominator = plan.base.numerator, plan.base.denominator
         self.paths: list[str] = []
         self.sample: Callable[[float], None] | None = None
-        self.rewind()
+        self.move_to(0)
 
-    def rewind(self) -> None:
-        """Start again before the first activation."""
-        self._times: Iterator[tuple[int, Fraction]] = self.rate.ticks(self.base)
-        self.tick = 0
+    def move_to(self, tick: int) -> None:
+        """Stand where everything up to and including `tick` has been done."""
+        self._ticks: Iterator[int] = self.rate.ticks(self._base, self._grid, after=tick)
+        self.tick = self.rate.last_tick(self._base, self._grid, tick)
         self.dt = 0.0
-        self.next_tick: int | None = None
-        self._look()
-
-    def _look(self) -> None:
-        following = next(self._times, None)
-        self.next_tick = None if following is None else following[0]
+        self.next_tick = next(self._ticks, None)
 
     def advance(self) -> None:
         """Move to the next activation."""
         assert self.next_tick is not None
-        ticks = self.next_tick - self.tick
-        self.dt = ticks * self.base.numerator / self.base.denominator
+        self.dt = (self.next_tick - self.tick) * self._numerator / self._denominator
         self.tick = self.next_tick
-        self._look()
+        self.next_tick = next(self._ticks, None)
 
 
 class _Entry:
@@ -102,6 +97,8 @@ class Master:
         self.component_steps = 0
         self._numerator, self._denominator = plan.base.numerator, plan.base.denominator
         bind_components(plan, seed=seed, members=members, active=self.active, fail=self._exclude)
+        self._lent = {p: c.environment for p, c in plan.flat.components.items()}
+        self._terminated = False
         self.draws = {
             d.name: d.apply(plan.flat.components, seed=seed, members=members)
             for d in plan.flat.dispersions
@@ -130,7 +127,7 @@ class Master:
             if group.rate == rate and group.sample is None:
                 break
         else:
-            number, group = len(self._groups), _Group(rate, self.plan.base)
+            number, group = len(self._groups), _Group(rate, self.plan)
             self._groups.append(group)
         for path, component in self.plan.flat.components.items():
             if component.rate == rate:
@@ -139,7 +136,7 @@ class Master:
 
     def observe(self, rate: Rate, sample: Callable[[float], None]) -> None:
         """Call `sample(t)` at a rate, after everything due has stepped. Cannot influence the run."""
-        group = _Group(rate, self.plan.base)
+        group = _Group(rate, self.plan)
         group.sample = sample
         self._groups.append(group)
 
@@ -164,12 +161,17 @@ class Master:
 
     # ------------------------------------------------------------------ running
 
-    def initialize(self) -> None:
-        """Publish everything at t = 0, in the order of end-reads."""
+    def initialize(self, *, observe: bool = True) -> None:
+        """Publish everything at t = 0, in the order of end-reads.
+
+        Nothing delayed has arrived then, and start-reads have nothing to hold: these inputs are
+        NaN, whatever the order. `observe` is false where a saved state replaces all of it.
+        """
         for entry in self._entries.values():
             try:
                 for transfer in entry.before:
-                    transfer(0)
+                    if not isinstance(transfer, DelayLine):
+                        transfer(0)
                 entry.component.initialize()
             except Exception as error:
                 raise self._step_error(entry.path, 0, error) from error
@@ -180,8 +182,9 @@ class Master:
         for path in self._entries:
             for transfer in self.wiring.latch.get(path, ()):
                 transfer(0)
+        self._check_members()
         for group in self._groups:
-            if group.sample is not None and group.rate.starts_at_zero:
+            if observe and group.sample is not None and group.rate.starts_at_zero:
                 group.sample(0.0)
         self._arm()
 
@@ -208,6 +211,17 @@ class Master:
         StepError
             If a component fails, or no member is left. What was recorded is untouched.
         """
+        if end < self.tick:
+            raise ConfigurationError(
+                f"cannot run to t = {self.seconds(end):.9g} s: this simulation stands at "
+                f"t = {self.seconds(self.tick):.9g} s\n  make another one, or set an earlier state"
+            )
+        for path, component in self.plan.flat.components.items():
+            if component._environment is not self._lent[path]:
+                raise ConfigurationError(
+                    f"'{path}' has been terminated, or another simulation of the same system has "
+                    "taken it over\n  run one after the other, or build the system twice"
+                )
         heap, groups, programs = self._heap, self._groups, self._programs
         numerator, denominator = self._numerator, self._denominator
         entry: _Entry | None = None
@@ -246,11 +260,9 @@ class Master:
                 if len(self.excluded) != n_excluded:
                     n_excluded = len(self.excluded)
                     self._check_members()
-        except TerrafixError as error:
-            if entry is None or isinstance(error, StepError):
-                raise
-            raise self._step_error(entry.path, self.tick, error) from error
         except Exception as error:
+            if entry is None and isinstance(error, StepError):  # no member is left
+                raise
             where = entry.path if entry is not None else "recorder"
             raise self._step_error(where, self.tick, error) from error
         self.tick = end
@@ -270,7 +282,7 @@ class Master:
         if not self.active.any():
             last = self.excluded[-1]
             raise StepError(
-                f"no member is left at t = {last['t_s']:g} s (tick {self.tick})\n"
+                f"no member is left at t = {last['t_s']:.9g} s (tick {self.tick})\n"
                 f"  the last, member {last['member']}, failed in '{last['component']}': "
                 f"{last['reason']}"
             )
@@ -280,14 +292,31 @@ class Master:
             str(error) if isinstance(error, TerrafixError) else f"{type(error).__name__}: {error}"
         )
         return StepError(
-            f"'{path}' failed at t = {self.seconds(tick):g} s (tick {tick})\n  {cause}"
+            f"'{path}' failed at t = {self.seconds(tick):.9g} s (tick {tick})\n  {cause}"
         )
 
     def terminate(self) -> None:
-        """Give back everything components hold, also after a failure."""
-        for component in self.plan.flat.components.values():
-            component.terminate()
+        """Give back everything components hold, also after a failure; a second call does nothing.
+
+        Raises
+        ------
+        StepError
+            If a component fails to terminate; the others are terminated all the same.
+        """
+        if self._terminated:
+            return
+        self._terminated = True
+        failure: tuple[str, Exception] | None = None
+        for path, component in self.plan.flat.components.items():
+            if component._environment is not self._lent[path]:
+                continue
+            try:
+                component.terminate()
+            except Exception as error:
+                failure = failure or (path, error)
             component.release()
+        if failure is not None:
+            raise self._step_error(failure[0], self.tick, failure[1]) from failure[1]
 
     # ------------------------------------------------------------------ checkpoints
 
@@ -313,7 +342,5 @@ class Master:
         for name, state in saved["links"].items():
             self.wiring.keepers[name].set_state(state)
         for group in self._groups:
-            group.rewind()
-            while group.next_tick is not None and group.next_tick <= self.tick:
-                group.advance()
+            group.move_to(self.tick)
         self._arm()

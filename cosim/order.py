@@ -71,14 +71,12 @@ def _loop_text(flat: FlatSystem, waiting: dict[str, set[str]], placed: set[str])
                     seen.add(target)
                     queue.append((target, [*taken, connection]))
     assert loop is not None
-    width = max(len(c.source) for c in loop)
+    ends = [(c.source, c.target) for c in loop]
+    width = max(len(path) for pair in ends for path in pair)
     lines = ["algebraic loop"]
-    for i, connection in enumerate(loop):
-        following = loop[(i + 1) % len(loop)]
-        lines.append(f"  {connection.source:<{width}} -> {connection.target}    connected")
-        lines.append(
-            f"  {connection.target:<{width}} => {following.source}    read at the end of the step"
-        )
+    for (source, target), (following, _) in zip(ends, [*ends[1:], ends[0]], strict=True):
+        lines.append(f"  {source:<{width}} -> {target:<{width}} connected")
+        lines.append(f"  {target:<{width}} => {following:<{width}} read at the end of the step")
     lines.append(
         "  connect an output that does not depend on the loop (a filter's 'prior', say), read one "
         "of these inputs at the start of its step, or give one connection a delay"

@@ -20,14 +20,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
+from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from terrafix.cosim.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    pass
 
 FloatArray = NDArray[np.float64]
 Unit = str | tuple[str, ...]
@@ -63,6 +60,19 @@ class Field:
     ragged: bool = False
     labels: tuple[str, ...] = ()
     doc: str = ""
+
+    def __post_init__(self) -> None:
+        n = self.shape[-1] if self.shape else None
+        if not isinstance(self.unit, str) and len(self.unit) != n:
+            raise ConfigurationError(
+                f"{len(self.unit)} units for shape {self.shape}; give one, or one for each element "
+                "of the last axis"
+            )
+        if self.labels and len(self.labels) != n:
+            raise ConfigurationError(
+                f"{len(self.labels)} labels for shape {self.shape}; give one for each element of "
+                "the last axis"
+            )
 
     @property
     def fixed_shape(self) -> tuple[int, ...]:
@@ -142,6 +152,20 @@ class Port(Declaration, Generic[View]):
                     raise ConfigurationError(f"field '{name}': bundles hold float64, not ragged")
         if ragged and not shape:
             raise ConfigurationError("a ragged port needs a capacity as its first extent")
+        if ragged and self.kind != "message":
+            raise ConfigurationError(
+                "only a message is ragged: its count travels with it\n"
+                "  declare a message, or a shared port with an open extent (None)"
+            )
+        if self.kind != "shared" and any(None in f.shape for f in self.fields.values()):
+            raise ConfigurationError(
+                f"shape {tuple(shape)} is open; only shared ports may be\n"
+                "  declare a ragged message with a capacity"
+            )
+        if window and at == "start":
+            raise ConfigurationError(
+                "a window is read at the end of the step: it holds the samples up to then"
+            )
         if at not in ("start", "end"):
             raise ConfigurationError(f"an input is read at 'start' or 'end', not '{at}'")
         if queue < 1:

@@ -25,6 +25,7 @@ Arrays = dict[str, NDArray[Any]]
 CHUNK_BYTES = 8 * 2**20
 FLUSH_SECONDS = 2.0
 MANIFEST = "manifest.json"
+SCHEMA = "terrafix-records/1"
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,10 @@ class Recorder:
                     count = Field(dtype=np.int64, doc="used length of the first axis")
                     self.variables.append(Variable(f"{path}.count", count))
                     self._sources.append(slot.count)
+        self._counts = [  # of messages: not NaN but 0 where there is none
+            next((i for i, s in enumerate(self._sources) if s is m.count), None)
+            for m, _ in self._messages
+        ]
         self._last_sequence = [m.sequence.copy() for m, _ in self._messages]
         row = sum(s.nbytes for s in self._sources) + 8
         self._capacity = int(np.clip(CHUNK_BYTES // max(row, 1), 1, 1024))
@@ -114,6 +119,9 @@ class Recorder:
             if stale.any():
                 for index in indices:
                     self._blank(index, i, stale)
+                count = self._counts[number]
+                if count is not None:
+                    self._chunk[count][i, stale] = 0
             last[:] = slot.sequence
         if not self._active.all():
             for index in range(len(self._chunk)):
@@ -214,8 +222,11 @@ def chunk_files(folder: Path, name: str) -> list[Path]:
 
 
 def _read_chunk(file: Path) -> tuple[NDArray[np.float64], list[NDArray[Any]]]:
-    with np.load(file, allow_pickle=False) as stored:
-        return stored["t"], [stored[f"v{i}"] for i in range(len(stored.files) - 1)]
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            return stored["t"], [stored[f"v{i}"] for i in range(len(stored.files) - 1)]
+    except Exception as error:  # a damaged file may fail in any way
+        raise ConfigurationError(f"records in '{file}' are damaged: {error}") from error
 
 
 def _read_chunks(folder: Path, name: str) -> list[tuple[NDArray[np.float64], list[NDArray[Any]]]]:
@@ -246,6 +257,7 @@ def write_atomically(target: Path, write: Any) -> None:
 def write_manifest(folder: Path, recorders: list[Recorder], about: dict[str, Any]) -> None:
     """Describe the chunks so that they can be read without the run that wrote them."""
     description = {
+        "schema": SCHEMA,
         "about": about,
         "recorders": {
             r.name: [

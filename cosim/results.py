@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.ports import Field
 from terrafix.cosim.record import MANIFEST, Recorder, Variable, _join, _read_chunks
+from terrafix.cosim.record import SCHEMA as RECORDS_SCHEMA
 
 if TYPE_CHECKING:
     import xarray
@@ -109,9 +110,15 @@ def build_dataset(
         variables[f"parameter:{path}"] = (dims, values, {"units": unit})
     coordinates |= {k: v for k, v in labels.coordinates.items()}
     plain = {
-        k: v if isinstance(v, str | int | float) else json.dumps(v) for k, v in attributes.items()
+        k: v if isinstance(v, str | int | float) else json.dumps(v, default=_plain)
+        for k, v in attributes.items()
     }
     return xarray.Dataset(variables, coordinates, {"schema": SCHEMA} | plain)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON does not know: numbers and arrays of NumPy, else the text of it."""
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
 
 
 def from_recorders(recorders: list[Recorder]) -> dict[str, Any]:
@@ -176,6 +183,12 @@ def salvage(folder: str | Path) -> xarray.Dataset:
         description = json.loads((folder / MANIFEST).read_text())
     except (OSError, json.JSONDecodeError) as error:
         raise ConfigurationError(f"'{folder}' holds no records: {error}") from error
+    schema = description.get("schema") if isinstance(description, dict) else None
+    if schema != RECORDS_SCHEMA:
+        raise ConfigurationError(
+            f"'{folder}' has schema {schema!r}; this version reads {RECORDS_SCHEMA!r}\n"
+            "  read it with the version of terrafix that wrote it"
+        )
     records: dict[str, Any] = {}
     for name, variables in description["recorders"].items():
         fields = [

@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str, float], None]
 """Called with what is being done and the fraction done, often."""
 SLICES = 400  # progress reports per run
+MAX_MEMBER = 2**32 - 1  # a word of the counter that noise is drawn from
 
 
 @dataclass
@@ -114,6 +116,11 @@ class Simulation:
     folder : Path, optional
         Where records are kept while the run goes on.
 
+    Attributes
+    ----------
+    checkpoint : Path or None
+        What an interrupted run can be resumed from.
+
     Raises
     ------
     SystemCheckError
@@ -135,9 +142,15 @@ class Simulation:
         self.members = _member_numbers(system.members if members is None else members)
         self.seed = system.seed if seed is None else seed
         self.folder = folder
-        self.master = Master(self.plan, seed=self.seed, members=self.members)
-        self.kernel = self._build_kernels(progress)
-        self.recorders = self._make_recorders()
+        self.checkpoint: Path | None = None
+        try:
+            self.master = Master(self.plan, seed=self.seed, members=self.members)
+            self.kernel = self._build_kernels(progress)
+            self.recorders = self._make_recorders()
+        except BaseException:
+            for component in self.plan.flat.components.values():
+                component.release()
+            raise
         self.parameters = self._read_back()
         self.configuration = configuration(self.plan)
         self.initialized = False
@@ -176,15 +189,19 @@ class Simulation:
             made = recorder(record.name, record.ports)
             self.master.observe(record_rate(flat, record), made.sample)
             recorders.append(made)
+        self._histories: dict[str, Recorder] = {}
         taken = {r.name for r in flat.records}
         for path, component in flat.components.items():
             if isinstance(component, Evaluation):
                 name = path.replace(".", "_")
-                name = name if name not in taken else f"{name}_history"
+                while name in taken:
+                    name += "_history"
+                taken.add(name)
                 made = recorder(name, [f"{path}.{p}" for p in component.recorded_ports()])
                 assert component.rate is not None
                 self.master.observe(component.rate, made.sample)
                 recorders.append(made)
+                self._histories[path] = made
         return recorders
 
     def _read_back(self) -> dict[str, tuple[str, NDArray[Any]]]:
@@ -203,10 +220,13 @@ class Simulation:
 
     def initialize(self) -> None:
         """Publish everything at t = 0."""
+        self._initialize(observe=True)
+
+    def _initialize(self, *, observe: bool) -> None:
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_manifest(self.folder, self.recorders, self.attributes("interrupted"))
-        self.master.initialize()
+        self.master.initialize(observe=observe)
         self.initialized = True
 
     def run_until(self, t: Exact) -> None:
@@ -237,8 +257,14 @@ class Simulation:
         if differing:
             key = differing[0]
             raise CheckpointError(_difference(key, mine[key], theirs.get(key)))
+        if self.folder is not None and not self.folder.is_dir():
+            raise CheckpointError(
+                f"the records that belong to the checkpoint are gone: there is no folder "
+                f"'{self.folder}'\n"
+                "  a run that has ended keeps them in its result; start again without --resume"
+            )
         if not self.initialized:
-            self.initialize()
+            self._initialize(observe=False)
         self.master.set_state(saved["master"])
         for recorder in self.recorders:
             recorder.set_state(saved["recorders"][recorder.name])
@@ -275,22 +301,24 @@ class Simulation:
     def evaluate(self) -> dict[str, Any]:
         """What evaluation components publish, from what was recorded so far."""
         found = {}
-        by_name = {r.name: r for r in self.recorders}
-        for path, component in self.plan.flat.components.items():
-            if isinstance(component, Evaluation):
-                name = path.replace(".", "_")
-                recorder = by_name.get(f"{name}_history") or by_name[name]
-                times, arrays = recorder.history()
-                prefix = f"{path}."
-                history = {n.removeprefix(prefix): a for n, a in arrays.items()}
-                found[path] = component.summarize(times, history)
+        for path, recorder in self._histories.items():
+            component = self.plan.flat.components[path]
+            assert isinstance(component, Evaluation)
+            times, arrays = recorder.history()
+            history = {n.removeprefix(f"{path}."): a for n, a in arrays.items()}
+            found[path] = component.summarize(times, history)
         return next(iter(found.values())) if len(found) == 1 else found
 
     def result(self, *, wall_s: float, status: str = "complete") -> Result:
         """Gather what was recorded."""
         from terrafix.cosim.results import build_dataset, from_recorders
 
-        evaluation = self.evaluate()
+        try:
+            evaluation = self.evaluate()
+        except Exception:
+            if status == "complete":
+                raise
+            evaluation = {}  # a history cut short must not cost the records
         attributes = self.attributes(status) | {"evaluation": evaluation}
         dataset = build_dataset(
             from_recorders(self.recorders), self.members, attributes, self.parameters
@@ -356,34 +384,68 @@ def simulate(
     """
     length = _duration(system, duration)
     out = None if out is None else _writable(Path(out))
+    if resume is not None and checkpoint is not None and Path(checkpoint) != Path(resume):
+        raise ConfigurationError(
+            f"a run resumed from '{resume}' keeps its checkpoints there, not in '{checkpoint}': "
+            "its records are beside it\n  give no other checkpoint"
+        )
     saved = None if resume is None else read_checkpoint(Path(resume))
     every = None if checkpoint_every is None else seconds(checkpoint_every, "checkpoint interval")
     if every is not None and every <= 0:
         raise RateError(f"checkpoint interval is {checkpoint_every} s; it must be positive")
     target = _checkpoint_path(system, checkpoint or resume, out)
     folder = _folder(out, target if every is not None or saved is not None else None)
-    if folder is not None and saved is None:
-        _rescue(folder)
     simulation = Simulation(system, members=members, seed=seed, folder=folder, progress=progress)
-    if simulation.master.ticks(length) == 0:
+    try:
+        _refuse_impossible(simulation, length, saved, every)
+        if folder is not None and saved is None:
+            _rescue(folder)
+        started = time.perf_counter()
+        try:
+            if saved is not None:
+                simulation.set_state(saved)
+                simulation.checkpoint = target
+            else:
+                simulation.initialize()
+            _fly(simulation, length, every, target, progress)
+        except (StepError, KeyboardInterrupt) as error:
+            result = _finish(simulation, started, _status(error), out)
+            with suppress(StepError):  # the first failure is the one to report
+                simulation.master.terminate()
+            raise RunError(_kept(error, result, simulation.checkpoint), result) from error
+        result = _finish(simulation, started, "complete", out)
+        try:
+            simulation.master.terminate()
+        except StepError as error:
+            raise RunError(_kept(error, result, None), result) from error
+        return result
+    finally:
+        simulation.master.terminate()
+
+
+def _refuse_impossible(
+    simulation: Simulation, length: Fraction, saved: dict[str, Any] | None, every: Fraction | None
+) -> None:
+    """Raise what can be known to be wrong before the first step."""
+    master, base = simulation.master, simulation.plan.base
+    if master.ticks(length) == 0:
         raise RateError(
             f"duration is {text_seconds(length)} s, shorter than the base step of "
-            f"{text_seconds(simulation.plan.base)} s"
+            f"{text_seconds(base)} s"
         )
-    started = time.perf_counter()
-    try:
-        if saved is not None:
-            simulation.set_state(saved)
-        else:
-            simulation.initialize()
-        _fly(simulation, length, every, target, progress)
-    except (StepError, KeyboardInterrupt) as error:
-        result = _finish(simulation, started, _status(error), out, folder)
-        raise RunError(_kept(error, result, target), result) from error
-    finally:
-        if not simulation.initialized:
-            simulation.master.terminate()
-    return _finish(simulation, started, "complete", out, folder)
+    if saved is not None and saved["master"]["tick"] > master.ticks(length):
+        raise CheckpointError(
+            f"the checkpoint is at t = {master.seconds(saved['master']['tick']):.9g} s, beyond the "
+            f"duration of {text_seconds(length)} s\n  give a longer duration"
+        )
+    if saved is None and every is None:
+        return
+    for path, component in simulation.plan.flat.components.items():
+        if not component.capabilities.state:
+            raise CheckpointError(
+                f"'{path}' ({type(component).__name__}) cannot save its state, so a run with it "
+                "has no checkpoints\n  run without --checkpoint-every"
+            )
 
 
 def _fly(
@@ -403,25 +465,22 @@ def _fly(
         master.run_until(stop)
         if stop in saves:
             write_checkpoint(target, simulation.get_state())
+            simulation.checkpoint = target
         if progress is not None:
             progress("running", stop / end)
 
 
-def _finish(
-    simulation: Simulation, started: float, status: str, out: Path | None, folder: Path | None
-) -> Result:
+def _finish(simulation: Simulation, started: float, status: str, out: Path | None) -> Result:
     from terrafix.cosim.results import write_netcdf
 
     wall = time.perf_counter() - started
-    try:
-        result = simulation.result(wall_s=wall, status=status)
-    finally:
-        simulation.master.terminate()
+    result = simulation.result(wall_s=wall, status=status)
     if out is not None:
         write_netcdf(result.dataset, out)
         result.out = out
-    if folder is not None and status == "complete":
-        shutil.rmtree(folder, ignore_errors=True)
+    superfluous = status == "complete" or (out is not None and simulation.checkpoint is None)
+    if simulation.folder is not None and superfluous:
+        shutil.rmtree(simulation.folder, ignore_errors=True)
     return result
 
 
@@ -429,11 +488,11 @@ def _status(error: BaseException) -> str:
     return "interrupted" if isinstance(error, KeyboardInterrupt) else f"failed: {error}"
 
 
-def _kept(error: BaseException, result: Result, checkpoint: Path) -> str:
+def _kept(error: BaseException, result: Result, checkpoint: Path | None) -> str:
     text = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error)
     if result.out is not None:
         text += f"\n  what was recorded until then is in {result.out}"
-    if checkpoint.is_file():
+    if checkpoint is not None:
         text += f"\n  resume with --resume {checkpoint}"
     return text
 
@@ -442,8 +501,17 @@ def _member_numbers(members: int | Sequence[int]) -> NDArray[np.int64]:
     if isinstance(members, bool) or (isinstance(members, int) and members < 1):
         raise ConfigurationError(f"members is {members}; an ensemble has at least 1")
     numbers = np.arange(members) if isinstance(members, int) else np.asarray(members)
-    if not len(numbers) or len(set(numbers.tolist())) != len(numbers) or numbers.min() < 0:
-        raise ConfigurationError(f"members {members} must be different numbers from 0 on")
+    if (
+        numbers.ndim != 1
+        or not len(numbers)
+        or numbers.dtype.kind not in "iu"
+        or len(set(numbers.tolist())) != len(numbers)
+        or numbers.min() < 0
+        or numbers.max() > MAX_MEMBER
+    ):
+        raise ConfigurationError(
+            f"members {members} must be different whole numbers from 0 to {MAX_MEMBER}"
+        )
     return numbers.astype(np.int64)
 
 
@@ -483,22 +551,25 @@ def _folder(out: Path | None, checkpoint: Path | None) -> Path | None:
 
 
 def _rescue(folder: Path) -> None:
-    """Turn what an interrupted run left into a file of its own before its folder is used again."""
+    """Turn what an interrupted run left into a file of its own before its folder is used again.
+
+    What cannot be read is moved aside, never removed.
+    """
     from terrafix.cosim.results import salvage, write_netcdf
 
     if not folder.is_dir():
         return
     number = 0
-    while (target := folder.with_name(f"{folder.stem}.interrupted{number or ''}.nc")).exists():
+    while (target := folder.with_name(f"{folder.stem}.interrupted{number or ''}.nc")).exists() or (
+        aside := target.with_suffix(".parts")
+    ).exists():
         number += 1
-    try:
-        dataset = salvage(folder)
-    except TerrafixError:
-        dataset = None
-    if dataset is not None and any(
-        s for d, s in dataset.sizes.items() if str(d).startswith("time")
-    ):
-        write_netcdf(dataset, target)
+    if any(folder.glob("*.npz")):
+        try:
+            write_netcdf(salvage(folder), target)
+        except TerrafixError:
+            folder.rename(aside)
+            return
     shutil.rmtree(folder)
 
 

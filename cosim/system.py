@@ -11,7 +11,7 @@ The same object comes from a TOML file (`terrafix.cosim.files`); both roads rais
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -24,6 +24,7 @@ from terrafix.cosim.errors import ConfigurationError, RateError, WiringError, ne
 from terrafix.cosim.ports import Port
 from terrafix.cosim.wiring import check_connection
 
+TABLES = frozenset({"component", "wiring", "expose", "record", "dispersion", "choice"})
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 Node = TypeVar("Node", bound="Component | System")
 
@@ -110,6 +111,7 @@ class System:
         self.exposed: dict[str, str] = {}
         self.records: list[Record] = []
         self.dispersions: list[Dispersion] = []
+        self._contained = False
 
     def __enter__(self) -> Self:
         return self
@@ -128,6 +130,10 @@ class System:
             If the name is no identifier or is taken, or the node belongs to a system already.
         """
         _checked_name(name, "component")
+        if name in TABLES:
+            raise ConfigurationError(
+                f"'{name}' cannot name a component: it is a table of system files"
+            )
         if name in self.nodes:
             raise ConfigurationError(f"system '{self.name}' has a component '{name}' already")
         if isinstance(node, Component):
@@ -138,10 +144,14 @@ class System:
             node.name = name
             if not node.missing_settings():
                 node.prepare()
-        elif node is self:
-            raise ConfigurationError(f"system '{self.name}' cannot contain itself")
         else:
-            node.name = name
+            if self in node._systems():
+                raise ConfigurationError(f"system '{self.name}' cannot contain itself")
+            if node._contained:
+                raise ConfigurationError(
+                    f"system '{node.name}' is part of a system already; make another one"
+                )
+            node.name, node._contained = name, True
         self.nodes[name] = node
         return node
 
@@ -172,7 +182,7 @@ class System:
             If the delay is negative or not exact.
         """
         source_path, target_path = self._path(source), self._path(target)
-        source_leaf, source_port = self.resolve(source_path)
+        _, source_port = self.resolve(source_path)
         target_leaf, target_port = self.resolve(target_path)
         check_connection(source_path, source_port, target_path, target_port)
         for other in self.connections:
@@ -226,12 +236,23 @@ class System:
                 f"system '{self.name}' has no component '{name}'\n"
                 f"  {nearest(name, self.nodes, what='components')}"
             )
-        del self.nodes[name]
+        node = self.nodes.pop(name)
+        if isinstance(node, Component):
+            node.name = ""
+        else:
+            node._contained = False
         self.connections = [
             c
             for c in self.connections
             if name not in (c.source.split(".")[0], c.target.split(".")[0])
         ]
+
+    def _systems(self) -> Iterator[System]:
+        """This system and all systems within."""
+        yield self
+        for node in self.nodes.values():
+            if isinstance(node, System):
+                yield from node._systems()
 
     def _path(self, port: PortRef | str) -> str:
         if isinstance(port, str):
@@ -282,6 +303,17 @@ class System:
             )
         return flat.components[path]
 
+    def _resolved(self, record: Record) -> Record:
+        """A record with exposed ports followed down; what does not exist is left to the check."""
+
+        def leaf(path: str) -> str:
+            try:
+                return self.resolve(path)[0]
+            except WiringError:
+                return path
+
+        return Record(record.name, tuple(leaf(p) for p in record.ports), record.rate)
+
     @classmethod
     def from_file(cls, path: str | Path, settings: Sequence[tuple[str, str]] = ()) -> System:
         """Read a system from a TOML file (`terrafix.cosim.files.read_system`)."""
@@ -317,7 +349,7 @@ class System:
             Connection(self.resolve(c.source)[0], self.resolve(c.target)[0], c.delay)
             for c in self.connections
         ]
-        flat.records += self.records
+        flat.records += [self._resolved(record) for record in self.records]
         flat.dispersions += self.dispersions
         return flat
 

@@ -101,7 +101,8 @@ class Compiler:
             except OSError as error:
                 raise CompilationError(f"'{shlex.join(self.command)}' failed: {error}") from error
         said = [line.strip() for line in (done.stderr + done.stdout).splitlines() if line.strip()]
-        complaint = next((line for line in said if "error" in line.lower()), *said[:1])
+        errors = [line for line in said if "error" in line.lower()]
+        complaint = (errors or said or ["no message"])[0]
         raise CompilationError(
             f"'{shlex.join(self.command)}' failed with exit status {done.returncode}: {complaint}"
         )
@@ -198,7 +199,7 @@ def _identify(command: tuple[str, ...]) -> Compiler | None:
     family = Path(command[0]).stem
     if "clang" in version:
         family = "clang (ziglang)" if "ziglang" in command else "clang"
-    elif "Free Software Foundation" in text:
+    elif family == "cc" and "Free Software Foundation" in text:
         family = "gcc"
     return Compiler(command, f"{family} {number[0]}" if number else family, version)
 

@@ -19,9 +19,7 @@ DIMENSIONLESS = ("", "1")
 def _registry() -> Any:
     import pint
 
-    registry = pint.UnitRegistry(cache_folder=None)
-    registry.define("pixel = [pixel] = px")
-    return registry
+    return pint.UnitRegistry()
 
 
 @lru_cache(maxsize=1024)

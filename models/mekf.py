@@ -221,7 +221,8 @@ def mekf_correct_model(update: str = "ekf") -> Model:
     Parameters
     ----------
     update : {"ekf", "iterated", "unscented"}
-        How the measurement is weighed.
+        How the measurement is weighed. The paper's update leaves the covariance centered on the
+        prior misalignment, an error of second order; the other two center it on the estimate.
 
     Returns
     -------
@@ -281,7 +282,7 @@ def mekf_correct_model(update: str = "ekf") -> Model:
         "r_e": prior["r_e"] + outcome.correction[:3],
         "v_e": prior["v_e"] + outcome.correction[3:6],
         "q_mu": normalized(product(from_rotation_vector(outcome.correction[6:]), prior["q_mu"])),
-        "P": outcome.P,
+        "P": outcome.P if update == "ekf" else _recentered(outcome.P, outcome.correction[6:]),
     }
     posterior = {k: ca.if_else(accepted, corrected[k], prior[k]) for k in prior}
     return Model(
@@ -304,6 +305,20 @@ def mekf_correct_model(update: str = "ekf") -> Model:
             "innovation.reason": reason,
         },
     )
+
+
+def _recentered(P: Any, dmu: Any) -> Any:
+    r"""Express a covariance (9, 9) about the corrected misalignment instead of the prior one.
+
+    The error :math:`\delta` about the prior and :math:`\eta` about the estimate are related by
+    :math:`\delta q(\delta\mu + \delta) = \delta q(\eta) \otimes \delta q(\delta\mu)`.
+    """
+    delta = ca.SX.sym("delta", 3)
+    corrected = from_rotation_vector(dmu)
+    turn = rotation_vector(product(from_rotation_vector(dmu + delta), inverse(corrected)))
+    by_delta = ca.substitute(ca.jacobian(turn, delta), delta, ca.SX.zeros(3))
+    J = ca.diagcat(ca.SX.eye(6), by_delta)
+    return mirrored(ca.mtimes(J, ca.mtimes(P, J.T)))
 
 
 def _measurement(prior: Any, fix: Any, q_be: Any, q_sb: Any) -> Measurement:

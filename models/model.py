@@ -123,13 +123,18 @@ class Model:
                 f"model '{self.name}': {sorted(both)} are given both as next values and as "
                 "derivatives; a state is either discrete or continuous"
             )
-        known = [s for group in self._symbol_groups() for s in group.values()]
+        known = {
+            element.element_hash()
+            for group in self._symbol_groups()
+            for symbol in group.values()
+            for element in ca.symvar(symbol)
+        }
         for kind in ("outputs", "next", "derivatives", "initial"):
             for key, expression in getattr(self, kind).items():
-                for symbol in ca.symvar(ca.SX(expression)):
-                    if not any(ca.depends_on(ca.SX(k), symbol) for k in known):
+                for element in ca.symvar(ca.SX(expression)):
+                    if element.element_hash() not in known:
                         raise ValueError(
-                            f"model '{self.name}': {kind}['{key}'] depends on '{symbol}', which "
+                            f"model '{self.name}': {kind}['{key}'] depends on '{element}', which "
                             "is not declared as an input, state, parameter, noise, step or time"
                         )
 

@@ -38,7 +38,8 @@ _FLOOR = 1e-12
 """Smallest relative pivot of an innovation covariance: correlations within 1e-12 of one fail."""
 
 _ITERATIONS = 5
-"""Gauss-Newton steps; at 0.1 deg and 1 km the fourth moves the estimate by below 1e-9 sigma."""
+"""Gauss-Newton steps. From 1 km and 0.1 deg the second moves the estimate by up to 0.3 sigma, the
+third by 5e-6, the fourth by 1e-8, the fifth by 2e-10."""
 
 
 @dataclass(frozen=True)

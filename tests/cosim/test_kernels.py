@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from terrafix.cosim import toolchain
 from terrafix.cosim.errors import ConfigurationError
+from terrafix.cosim.kernel_compiled import kernel_source
+from terrafix.cosim.kernel_virtual import VirtualMachineKernel
 from terrafix.cosim.kernels import Argument, Result, Specification, build_kernel, build_kernels
 from terrafix.cosim.noise import NormalStream, normal_quantile, stream_key
 
@@ -157,7 +159,8 @@ def pointwise(name: str, n: int, expression) -> Specification:
     """A function of standard normals alone: y = expression(w)."""
     w = ca.SX.sym("w", n)
     function = ca.Function(name, [w], [expression(w)])
-    return Specification(function, [Argument("w", n, "noise")], [Result("y", n)])
+    results = [Result("y", function.numel_out(0))]
+    return Specification(function, [Argument("w", n, "noise")], results)
 
 
 def evaluate(kernel, members, step: int) -> np.ndarray:
@@ -191,10 +194,36 @@ def test_transcendental_functions_agree_to_rounding(monkeypatch):
 @pytest.mark.parametrize("n", [1, 2, 3, 9, 5000])
 def test_noise_of_kernels_is_that_of_streams(kind, n, monkeypatch):
     """Odd and even counts, more than are drawn at once, members far apart."""
-    kernel = build(kind, pointwise("noise", n, lambda w: w), monkeypatch)
+    some = sorted({0, n // 2, n - 1})
+    kernel = build(kind, pointwise("noise", n, lambda w: w[some]), monkeypatch)
     for members, step in itertools.product(([0], range(150), [2**32 - 1, 3]), (0, 2**32, -1)):
-        expected = NormalStream.from_key(KEY, np.asarray(members)).draw(step, n)
+        expected = NormalStream.from_key(KEY, np.asarray(members)).draw(step, n)[:, some]
         assert evaluate(kernel, members, step).tobytes() == expected.tobytes()
+
+
+def test_generated_code_is_free_of_null_checks():
+    """They make compilers slow: 5 minutes instead of seconds at 5,000 results."""
+    for specification in (walk(), pointwise("many", 50, lambda w: w)):
+        generated = kernel_source(VirtualMachineKernel(specification)).split("TERRAFIX_FUNCTION")[0]
+        body = generated[generated.index("static int casadi_f0") :]
+        body = body[: body.index("CASADI_SYMBOL_EXPORT")]
+        assert "res[0][0]=" in body
+        assert "?" not in body
+        assert "if (" not in body
+
+
+@both
+def test_functions_that_call_functions_are_kernels_too(kind, monkeypatch):
+    """MX code passes null pointers within: its checks must stay."""
+    a, b = ca.SX.sym("a", 2), ca.SX.sym("b", 2)
+    inner = ca.Function("inner", [a, b], [a + 2 * b, a * b], {"never_inline": True})
+    w = ca.MX.sym("w", 2)
+    first, second = inner(w, ca.MX.zeros(2)), inner(ca.MX.zeros(2), w)
+    function = ca.Function("outer", [w], [first[0] + second[0]])
+    specification = Specification(function, [Argument("w", 2, "noise")], [Result("y", 2)])
+    y = evaluate(build(kind, specification, monkeypatch), range(7), 1)
+    w = NormalStream.from_key(KEY, np.arange(7)).draw(1, 2)
+    assert y.tobytes() == (w + 2 * w).tobytes()
 
 
 @needs_compiler
@@ -390,6 +419,7 @@ def counted(tmp_path, monkeypatch):
     monkeypatch.setenv("TERRAFIX_CC", str(script))
     monkeypatch.setenv("TERRAFIX_KERNEL", "c")
     monkeypatch.setenv("TERRAFIX_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(toolchain, "_session_directory", lambda: tmp_path / "session")
     return lambda: len(log.read_text().splitlines()) if log.exists() else 0
 
 
@@ -460,7 +490,7 @@ def test_a_damaged_library_is_rebuilt(counted, damage, tmp_path):
     compiled = counted()
     assert stepped() == first
     assert counted() == compiled + 1
-    assert [path.name for path in libraries()] == [library.name]
+    assert len(libraries()) == 1
 
 
 @posix

@@ -41,7 +41,9 @@ def test_axes_are_forward_right_and_nadir(start_e, velocity):
     forward, right, _ = T @ followed
     assert forward > 7000
     assert abs(right) < 1e-10
-    np.testing.assert_allclose(T[1], -np.cross(r_e, followed) / np.linalg.norm(np.cross(r_e, followed)), atol=1e-15)
+    np.testing.assert_allclose(
+        T[1], -np.cross(r_e, followed) / np.linalg.norm(np.cross(r_e, followed)), atol=1e-15
+    )
 
 
 def test_the_two_velocities_differ_by_the_crab_angle(start_e):
@@ -78,7 +80,10 @@ def test_increments_add_up_to_the_inertial_rotation(constants, start_i, start_e)
     for k in range(n):
         moved, states = orbit.advance(**states, step=dt, time=(k + 1) * dt, **constants)
         outputs, following = attitude.advance(
-            q_be=q_be, r_e=moved["r_e"], v_e=moved["v_e"], step=dt,
+            q_be=q_be,
+            r_e=moved["r_e"],
+            v_e=moved["v_e"],
+            step=dt,
             rotation_rate=EARTH.rotation_rate,
         )
         signs.append(following["q_be"] @ q_be)
@@ -137,5 +142,5 @@ def test_bias_draw_is_used_at_the_start_alone():
 
 
 def test_unknown_velocity_is_refused():
-    with pytest.raises(ValueError, match="velocity must be one of .*got 'air'"):
+    with pytest.raises(ValueError, match=r"velocity must be one of .*got 'air'"):
         lvlh_attitude_model("air")

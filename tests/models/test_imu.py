@@ -1,11 +1,10 @@
 """Inertial sensor errors, confirmed by their Allan deviation."""
 
+import allantools
 import numpy as np
 import pytest
 
 from terrafix.models.imu import imu_model
-
-allantools = pytest.importorskip("allantools")
 
 DT = 0.01  # [s]
 
@@ -24,12 +23,12 @@ def simulate(model, n, parameters, seed):
     state = ["accel_bias_b", "gyro_bias_b"]
     values = dict.fromkeys(names, 0.0) | parameters | {"step": DT}
     x = {s: start[f"next_{s}_"] for s in state}
-    columns = [np.broadcast_to(values[k], (step.numel_in(i), n)) if k not in series else series[k].T
-               for i, k in enumerate(names)]
+    columns = [
+        np.broadcast_to(values[k], (step.numel_in(i), n)) if k not in series else series[k].T
+        for i, k in enumerate(names)
+    ]
     order = [names.index(s) for s in state]
-    folded = step.mapaccum(
-        "run", n, order, [step.name_out().index(f"next_{s}_") for s in state]
-    )
+    folded = step.mapaccum("run", n, order, [step.name_out().index(f"next_{s}_") for s in state])
     for i, s in zip(order, state, strict=True):
         columns[i] = x[s]
     outputs = dict(zip(folded.name_out(), folded.call(columns), strict=True))
@@ -45,10 +44,15 @@ def test_white_noise_falls_with_slope_minus_one_half(increment):
     """sigma(T) = N / sqrt(T). 3 axes x 40,000 samples: 3 % at 1 s (120 s^-1 intervals, 3 sigma)."""
     outputs, _ = simulate(imu_model(), 40_000, {NOISE_OF[increment]: 2e-3}, seed=3)
     times = np.array([0.02, 0.1, 0.5, 2.0])
-    sigma = np.sqrt(np.mean([
-        allantools.oadev(x / DT, rate=1 / DT, data_type="freq", taus=times)[1] ** 2
-        for x in outputs[increment].T
-    ], axis=0))
+    sigma = np.sqrt(
+        np.mean(
+            [
+                allantools.oadev(x / DT, rate=1 / DT, data_type="freq", taus=times)[1] ** 2
+                for x in outputs[increment].T
+            ],
+            axis=0,
+        )
+    )
     # relative sigma of the deviation is about 1 / sqrt(2 x 3 x 400 s / T): 3 % at 2 s; 3 sigma
     np.testing.assert_allclose(sigma, 2e-3 / np.sqrt(times), rtol=0.09)
     slope = np.polyfit(np.log(times), np.log(sigma), 1)[0]
@@ -60,10 +64,15 @@ def test_bias_walk_rises_with_slope_one_half(increment):
     """sigma(T) = K sqrt(T / 3), where T is many samples."""
     outputs, _ = simulate(imu_model(), 40_000, {WALK_OF[increment]: 1e-4}, seed=4)
     times = np.array([0.5, 1.0, 2.0, 4.0])
-    sigma = np.sqrt(np.mean([
-        allantools.oadev(x / DT, rate=1 / DT, data_type="freq", taus=times)[1] ** 2
-        for x in outputs[increment].T
-    ], axis=0))
+    sigma = np.sqrt(
+        np.mean(
+            [
+                allantools.oadev(x / DT, rate=1 / DT, data_type="freq", taus=times)[1] ** 2
+                for x in outputs[increment].T
+            ],
+            axis=0,
+        )
+    )
     # relative sigma about 1 / sqrt(2 x 3 x 400 s / 4 s) = 4 % at 4 s; 3 sigma
     np.testing.assert_allclose(sigma, 1e-4 * np.sqrt(times / 3), rtol=0.12)
     slope = np.polyfit(np.log(times), np.log(sigma), 1)[0]
@@ -88,8 +97,11 @@ def test_scale_factor_and_perfect_sensor():
     np.testing.assert_array_equal(outputs["delta_v_b"], true)
     np.testing.assert_array_equal(outputs["delta_theta_b"], true)
     outputs, _ = imu_model().advance(
-        delta_v_b_true=true, delta_theta_b_true=true, accel_scale_factor=1e-4,
-        gyro_scale_factor=-2e-4, step=DT,
+        delta_v_b_true=true,
+        delta_theta_b_true=true,
+        accel_scale_factor=1e-4,
+        gyro_scale_factor=-2e-4,
+        step=DT,
     )
     np.testing.assert_allclose(outputs["delta_v_b"], 1.0001 * true, rtol=1e-15)
     np.testing.assert_allclose(outputs["delta_theta_b"], 0.9998 * true, rtol=1e-15)
@@ -114,5 +126,5 @@ def test_gauss_markov_bias_is_the_same_process_at_any_step():
 
 
 def test_unknown_bias_process_is_refused():
-    with pytest.raises(ValueError, match="bias must be one of .*got 'constant'"):
+    with pytest.raises(ValueError, match=r"bias must be one of .*got 'constant'"):
         imu_model("constant")

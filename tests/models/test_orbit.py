@@ -120,7 +120,9 @@ def test_order_of_integration_is_four(constants, start_i):
     steps = np.array([120.0, 60.0, 30.0])
     reference = propagate(orbit_model(), constants, start_i, 1.0, 3600)
     errors = [
-        np.linalg.norm((propagate(orbit_model(), constants, start_i, h, round(3600 / h)) - reference)[:3])
+        np.linalg.norm(
+            (propagate(orbit_model(), constants, start_i, h, round(3600 / h)) - reference)[:3]
+        )
         for h in steps
     ]
     slopes = np.diff(np.log(errors)) / np.diff(np.log(steps))
@@ -184,7 +186,7 @@ def test_circular_orbit_has_the_circular_speed():
 
 
 def test_unknown_gravity_is_refused():
-    with pytest.raises(ValueError, match="gravity must be one of .*got 'j3'"):
+    with pytest.raises(ValueError, match=r"gravity must be one of .*got 'j3'"):
         orbit_model("j3")
     with pytest.raises(ValueError, match="gravity"):
         gravity_acceleration("")

@@ -74,9 +74,7 @@ def test_exponential_and_logarithm_have_derivatives_at_zero():
     np.testing.assert_array_equal(
         forward(np.zeros(3)).full(), np.vstack([np.eye(3) / 2, np.zeros(3)])
     )
-    np.testing.assert_array_equal(
-        back(np.array(qt.IDENTITY)).full()[:, :3], 2 * np.eye(3)
-    )
+    np.testing.assert_array_equal(back(np.array(qt.IDENTITY)).full()[:, :3], 2 * np.eye(3))
 
 
 def test_small_rotations_are_short_by_a_twelfth_of_the_cube():

@@ -42,7 +42,7 @@ vectors = st.tuples(unit, unit, unit).map(np.array)
 @st.composite
 def states(draw):
     """Random states, attitudes and misalignments (large ones too); pixel before the antenna."""
-    r_e = 7.07e6 * (draw(vectors) + [0, 0, 2]) / 2
+    r_e = 7.07e6 * (draw(vectors) + np.array([0, 0, 2])) / 2
     q_be, q_mu = (from_rotation_vector_array(3 * draw(vectors)) for _ in range(2))
     mount = q_sb(draw(st.floats(0.2, 0.9)), draw(st.floats(-0.2, 0.2)))
     slant = draw(st.floats(5e5, 1.2e6))
@@ -50,7 +50,7 @@ def states(draw):
     T = rotation_matrix_array(product_array(q_mu, product_array(mount, q_be)))
     return {
         "r_e": r_e,
-        "v_e": 7.5e3 * (draw(vectors) + [2, 0, 0]) / 2,
+        "v_e": 7.5e3 * (draw(vectors) + np.array([2, 0, 0])) / 2,
         "q_mu": q_mu,
         "dmu": np.zeros(3),
         "q_be": q_be,
@@ -102,15 +102,22 @@ def test_misalignment_error_multiplies_from_the_left(values, direction):
     with_error = MODEL(**values | {"dmu": dmu})["y"]
     error = from_rotation_vector_array(dmu)
     moved = product_array(error, values["q_mu"])
-    np.testing.assert_allclose(MODEL(**values | {"q_mu": moved})["y"], with_error, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(
+        MODEL(**values | {"q_mu": moved})["y"], with_error, rtol=1e-11, atol=1e-12
+    )
 
 
 def test_the_wrong_order_of_the_product_would_show(start_e):
     r_e, v_e, q_be = start_e
     q_mu, dmu = from_rotation_vector_array([0.3, 0.8, -1.0]), np.array([0.02, -0.01, 0.03])
     T = rotation_matrix_array(product_array(q_mu, product_array(q_sb(LOOK, 0), q_be)))
-    values = {"r_e": r_e, "v_e": v_e, "q_be": q_be, "q_sb": q_sb(LOOK, 0),
-              "r_f_e": r_e + T.T @ [1e4, 2e4, 8.6e5]}
+    values = {
+        "r_e": r_e,
+        "v_e": v_e,
+        "q_be": q_be,
+        "q_sb": q_sb(LOOK, 0),
+        "r_f_e": r_e + T.T @ [1e4, 2e4, 8.6e5],
+    }
     right = MODEL(**values, q_mu=q_mu, dmu=dmu)["y"]
     wrong = MODEL(**values, q_mu=product_array(q_mu, from_rotation_vector_array(dmu)))["y"]
     assert np.abs(wrong - right)[:2].max() > 1e-3
@@ -133,8 +140,13 @@ def test_nominal_antenna_axes(look, squint):
 def fix(start_e, boresight="true", **values):
     r_e, v_e, q_be = start_e
     defaults = {
-        "r_e": r_e, "v_e": v_e, "q_be": q_be, "q_mu": [0, 0, 0, 1], "look": LOOK,
-        "radius": EARTH.radius, "flattening": EARTH.flattening,
+        "r_e": r_e,
+        "v_e": v_e,
+        "q_be": q_be,
+        "q_mu": [0, 0, 0, 1],
+        "look": LOOK,
+        "radius": EARTH.radius,
+        "flattening": EARTH.flattening,
     }
     return synthetic_fix_model(boresight)(**defaults | values)
 
@@ -145,8 +157,9 @@ def test_pixel_lies_on_the_true_boresight_and_the_ellipsoid(start_e):
     made = fix(start_e, q_mu=q_mu)
     assert made["fix.valid"] == 1
     assert abs(geodetic_from_ecef_array(made["fix.r_f_e"])[2]) < 1e-8
-    predicted = MODEL(r_e=r_e, v_e=v_e, q_mu=q_mu, q_be=q_be, q_sb=q_sb(LOOK, 0),
-                      r_f_e=made["fix.r_f_e"])["y"]
+    predicted = MODEL(
+        r_e=r_e, v_e=v_e, q_mu=q_mu, q_be=q_be, q_sb=q_sb(LOOK, 0), r_f_e=made["fix.r_f_e"]
+    )["y"]
     # at the true state the prediction is the measurement: tangents 0 to the rounding of 7e6 m
     np.testing.assert_allclose(predicted, made["fix.y"], rtol=1e-14, atol=1e-14)
     np.testing.assert_array_equal(made["fix.y"][:2], [0, 0])
@@ -158,8 +171,14 @@ def test_noise_goes_where_it_belongs(start_e):
     """Range and speed noise into y; the pixel's error into its reported position alone."""
     clean = fix(start_e)
     noisy = fix(
-        start_e, range_sigma=2.0, speed_sigma=0.5, geolocation_sigma=[8, 5, 2],
-        geolocation_bias=[1, 2, 3], range_noise=1.5, speed_noise=-2.0, geolocation_noise=[1, -1, 2],
+        start_e,
+        range_sigma=2.0,
+        speed_sigma=0.5,
+        geolocation_sigma=[8, 5, 2],
+        geolocation_bias=[1, 2, 3],
+        range_noise=1.5,
+        speed_noise=-2.0,
+        geolocation_noise=[1, -1, 2],
     )
     np.testing.assert_allclose(noisy["fix.y"] - clean["fix.y"], [0, 0, 3.0, -1.0], atol=1e-9)
     np.testing.assert_allclose(noisy["fix.r_f_e"] - clean["fix.r_f_e"], [9, -3, 7], atol=2e-9)
@@ -191,5 +210,5 @@ def test_mount_draws_and_walks_from_the_left():
 
 
 def test_unknown_boresight_is_refused():
-    with pytest.raises(ValueError, match="boresight must be one of .*got 'left'"):
+    with pytest.raises(ValueError, match=r"boresight must be one of .*got 'left'"):
         synthetic_fix_model("left")

@@ -83,5 +83,5 @@ def test_pass_geometry(constants, start_i, time, satellite, pixel, slant, incide
 
 
 def test_a_place_out_of_reach_is_refused():
-    with pytest.raises(ValueError, match="latitude 89.9000.*out of reach at inclination 98.16"):
+    with pytest.raises(ValueError, match=r"latitude 89.9000.*out of reach at inclination 98.16"):
         boresight_start(ALOS, np.radians(89.9), 0.0, LOOK)

@@ -1,0 +1,48 @@
+# Everything here sets itself up in .venv from a fresh clone: Python, make and a package index.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+OUT := .demo
+
+.PHONY: demo test quick lint types campaigns benchmarks clean
+
+## the main job: a spacecraft that has lost GPS finds itself again (100 members, table and picture)
+demo: $(STAMP)
+	@mkdir -p $(OUT)
+	$(BIN)/terrafix run examples/spacecraft_sar_open_loop.toml \
+	    --out $(OUT)/open_loop.nc --plot $(OUT)/open_loop.png
+
+## all tests, with lint and types
+test: $(STAMP) lint types
+	$(BIN)/python -m pytest -q -n 2
+
+## tests alone
+quick: $(STAMP)
+	$(BIN)/python -m pytest -q -n 2 -x
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+# an editable install is opaque to type checkers: check what would be installed
+types: $(STAMP)
+	@rm -rf build/types
+	@$(BIN)/pip install -q --no-deps --disable-pip-version-check --target build/types .
+	MYPYPATH=build/types $(BIN)/mypy -p terrafix
+
+## minutes-long Monte Carlo campaigns, in the numbers of the papers
+campaigns: $(STAMP)
+	$(BIN)/python -m pytest -q -m campaign -n 2
+
+## the promised numbers, as ratios against a reference in the same run
+benchmarks: $(STAMP)
+	$(BIN)/python benchmarks/run.py
+
+$(STAMP): pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[test]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build $(OUT) *.egg-info src/*.egg-info

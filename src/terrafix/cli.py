@@ -1,0 +1,343 @@
+"""The command line: ``terrafix run | check | graph | components``.
+
+Exit status: 0 fine, 1 a run failed, 2 bad input. With ``--json`` standard output is exactly one
+JSON object; everything else goes to standard error. Nothing heavy is imported before a command
+needs it, so that ``terrafix --help`` is immediate.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from terrafix.cosim.errors import ConfigurationError, StepError, SystemCheckError, TerrafixError
+
+if TYPE_CHECKING:
+    from terrafix.cosim.run import Result
+    from terrafix.cosim.system import System
+
+FAILED, REFUSED = 1, 2
+FIGURES = (".png", ".svg", ".pdf")
+DIAGRAMS = (".svg", ".png", ".mmd")
+Command = TypeVar("Command", bound=Callable[..., Any])
+Settings = tuple[tuple[str, str], ...]
+
+
+class Cli(click.Group):
+    """A command group that reports errors and sets the exit status by the rules above."""
+
+    def main(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, **options: Any
+    ) -> None:
+        """Run the command line and leave with an exit status."""
+        words = list(sys.argv[1:] if args is None else args)
+        options["standalone_mode"] = False
+        try:
+            status = super().main(words, prog_name or "terrafix", **options) or 0
+        except Exception as error:
+            status = _report(error, as_json="--json" in words)
+        sys.exit(status)
+
+
+def _report(error: Exception, *, as_json: bool) -> int:
+    """Explain an error on standard error (and as JSON), and return the exit status."""
+    status, problems = REFUSED, [error]
+    if isinstance(error, SystemCheckError):
+        problems = list(error.problems)
+        text = str(error)
+    elif isinstance(error, TerrafixError):
+        status = FAILED if isinstance(error, StepError) else REFUSED
+        text = f"{type(error).__name__}: {error}"
+    elif isinstance(error, click.Abort):
+        status, text = FAILED, "interrupted"
+    elif isinstance(error, click.ClickException):
+        text = ""
+        error.show()
+    else:
+        status = FAILED
+        text = (
+            f"{type(error).__name__}: {' '.join(str(error).split())}: this is a bug in terrafix; "
+            "TERRAFIX_TRACEBACK=1 shows where"
+        )
+        if os.environ.get("TERRAFIX_TRACEBACK"):
+            import traceback
+
+            traceback.print_exception(error)
+    if text:
+        print(text, file=sys.stderr)
+    if as_json:
+        described = [{"type": type(p).__name__, "message": _message(p)} for p in problems]
+        refused: dict[str, Any] = {"error": {"status": status, "problems": described}}
+        if isinstance(error, SystemCheckError):
+            refused |= {"system": error.system, "ok": False, "problems": described}
+        _print_json(refused)
+    return status
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, click.Abort):
+        return "interrupted"
+    return error.format_message() if isinstance(error, click.ClickException) else str(error)
+
+
+def _print_json(content: dict[str, Any]) -> None:
+    import json
+
+    print(json.dumps(plain(content), allow_nan=False))
+
+
+def plain(value: Any) -> Any:
+    """Turn a value into what JSON can hold; numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [plain(v) for v in value]
+    if hasattr(value, "tolist"):  # NumPy arrays and numbers
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if value - value == 0.0 else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)
+
+
+# ------------------------------------------------------------------------- shared by commands
+
+
+def _pairs(
+    context: click.Context,  # noqa: ARG001 - click's signature
+    parameter: click.Parameter,  # noqa: ARG001
+    values: tuple[str, ...],
+) -> Settings:
+    pairs = []
+    for text in values:
+        path, equals, value = text.partition("=")
+        if not equals or not path.strip():
+            raise ConfigurationError(
+                f"--set '{text}' sets nothing\n  write --set PATH=VALUE, as in --set duration=10"
+            )
+        pairs.append((path.strip(), value.strip()))
+    return tuple(pairs)
+
+
+_system = click.argument("system", metavar="SYSTEM.toml")
+_set = click.option(
+    "--set",
+    "settings",
+    metavar="PATH=VALUE",
+    multiple=True,
+    callback=_pairs,
+    help="Set a parameter, a choice or a key of the system; may be given again.",
+)
+_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+
+
+def _target(option: str, text: str | None, suffixes: tuple[str, ...]) -> Path | None:
+    """The file an option names, refused now if it could not be written later."""
+    if text is None:
+        return None
+    path = Path(text)
+    if path.suffix.lower() not in suffixes:
+        raise ConfigurationError(
+            f"{option} '{text}' is no {' or '.join(suffixes)} file\n"
+            f"  its ending says what is written: name it '{path.with_suffix(suffixes[0]).name}'"
+        )
+    if path.is_dir():
+        raise ConfigurationError(f"{option} '{text}' is a folder; name a file in it")
+    if not path.parent.is_dir():
+        raise ConfigurationError(
+            f"cannot write {option} '{text}': there is no folder '{path.parent}'"
+        )
+    probe = path.with_name(f".{path.name}.{os.getpid()}.probe")
+    try:
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {option} '{text}': {error.strerror}") from error
+    return path
+
+
+def _read(path: str, settings: Settings) -> System:
+    from terrafix.cosim.files import read_system
+
+    return read_system(path, settings)
+
+
+def _show(*renderables: Any) -> None:
+    """Print for a person; wide enough for tables where nobody's terminal says otherwise."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = 100
+    console.print(*renderables, sep="\n")
+
+
+# ------------------------------------------------------------------------- commands
+
+
+@click.group(cls=Cli, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="terrafix", prog_name="terrafix")
+def main() -> None:
+    """Fly, check, draw and list systems of terrain-relative navigation.
+
+    Exit status: 0 fine, 1 a run failed, 2 bad input.
+    """
+
+
+@main.command()
+@_system
+@click.option("--members", type=click.IntRange(min=1), metavar="N", help="Size of the ensemble.")
+@_set
+@click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Root seed.")
+@click.option("--duration", metavar="S", help='Simulated time, exact: "590.4" or "10 min".')
+@click.option("--out", metavar="FILE.nc", help="Write records to a NetCDF file.")
+@click.option("--plot", metavar="FILE.png", help="Draw the result (.png, .svg or .pdf).")
+@click.option("--checkpoint-every", metavar="S", help="Simulated seconds between checkpoints.")
+@click.option("--resume", metavar="FILE", help="Continue from a checkpoint.")
+@_json
+@click.option("--quiet", is_flag=True, help="Nothing but errors on standard error.")
+def run(
+    system: str,
+    members: int | None,
+    settings: Settings,
+    seed: int | None,
+    duration: str | None,
+    out: str | None,
+    plot: str | None,
+    checkpoint_every: str | None,
+    resume: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    """Run a system, once or as an ensemble."""
+    from terrafix.progress import ProgressBar, stderr_is_terminal
+
+    target, figure = _target("--out", out, (".nc",)), _target("--plot", plot, FIGURES)
+
+    def say_kernel() -> None:
+        from terrafix.cosim.toolchain import describe
+
+        if not quiet and any(c.capabilities.symbolic for c in loaded.flatten().components.values()):
+            print(describe(), file=sys.stderr)
+
+    shown = not quiet and stderr_is_terminal()
+    failure: StepError | None = None
+    with ProgressBar(shown=shown, first="preparing", on_running=say_kernel) as progress:
+        from terrafix.cosim.run import RunError, simulate
+
+        loaded = _read(system, settings)
+        if figure is not None:
+            _drawable(loaded)
+        try:
+            result = simulate(
+                loaded,
+                members=members,
+                seed=seed,
+                duration=duration,
+                out=target,
+                checkpoint_every=checkpoint_every,
+                resume=resume,
+                progress=progress,
+            )
+        except RunError as error:
+            failure, result = error, error.result
+        except TerrafixError as error:
+            if progress.running:  # it was no bad input: a disk that is full, say
+                raise StepError(str(error)) from error
+            raise
+        drawn = figure is not None and _draw(result, figure, failed=failure is not None)
+    if as_json:
+        files = {"out": result.out, "plot": figure if drawn else None}
+        _print_json(result.summary() | files)
+    else:
+        from terrafix.cosim.tables import result_tables
+
+        _show(*result_tables(result))
+    if not quiet:
+        written = [result.out] if result.out else []
+        for path in [*written, figure] if drawn else written:
+            print(f"wrote {path}", file=sys.stderr)
+    if failure is not None:
+        stopped = isinstance(failure.__cause__, KeyboardInterrupt)
+        print(failure if stopped else f"StepError: {failure}", file=sys.stderr)
+    return 0 if failure is None else FAILED
+
+
+def _drawable(system: System) -> None:
+    """Refuse to draw a system that records nothing, before it runs."""
+    from terrafix.cosim.evaluation import Evaluation
+
+    flat = system.flatten()
+    if not flat.records and not any(isinstance(c, Evaluation) for c in flat.components.values()):
+        raise ConfigurationError(
+            f"--plot: system '{system.name}' records nothing that could be drawn\n"
+            "  add a [record.NAME] with ports, or an evaluation component"
+        )
+
+
+def _draw(result: Result, figure: Path, *, failed: bool) -> bool:
+    from terrafix.cosim.plots import plot_result
+
+    try:
+        plot_result(result.dataset, figure)
+    except ConfigurationError as error:
+        if not failed:
+            raise StepError(f"the run is complete, but {error}") from error
+        return False  # a run that failed at its start has nothing to show
+    return True
+
+
+@main.command()
+@_system
+@_set
+@_json
+def check(system: str, settings: Settings, as_json: bool) -> None:
+    """Find every mistake in a system, and say what it consists of."""
+    from terrafix.cosim.check import check as check_system
+    from terrafix.cosim.listing import plan_content, plan_tables
+
+    plan = check_system(_read(system, settings))
+    if as_json:
+        _print_json(plan_content(plan))
+    else:
+        _show(*plan_tables(plan))
+
+
+@main.command()
+@_system
+@_set
+@click.option("-o", "out", metavar="FILE", help="Write .svg, .png or .mmd (Mermaid) there.")
+def graph(system: str, settings: Settings, out: str | None) -> None:
+    """Draw a system; without -o, print it as Mermaid text."""
+    from terrafix.cosim.graph import draw, mermaid
+
+    target = _target("-o", out, DIAGRAMS)
+    loaded = _read(system, settings)
+    if target is None:
+        print(mermaid(loaded), end="")
+    elif target.suffix.lower() == ".mmd":
+        target.write_text(mermaid(loaded), encoding="utf-8")
+    else:
+        draw(loaded, target)
+
+
+@main.command()
+@click.argument("kind", metavar="[TYPE]", required=False)
+@_json
+def components(kind: str | None, as_json: bool) -> None:
+    """List component types, or the parameters and ports of one type."""
+    from terrafix.cosim import listing
+
+    content = listing.types_content() if kind is None else listing.type_content(kind)
+    if as_json:
+        _print_json(content)
+    elif kind is None:
+        _show(*listing.types_tables(content))
+    else:
+        _show(*listing.type_tables(content))
