@@ -12,8 +12,7 @@ from terrafix.cosim.clock import Rate
 from terrafix.cosim.evaluation import Evaluation, FloatArray, History, Quantity, consistency
 from terrafix.cosim.ports import BundleInput, Input, MessageInput, Output
 from terrafix.models.consistency import normalized_square
-from terrafix.models.mekf import REASONS
-from terrafix.models.quaternion import inverse_array, product_array, rotation_vector_array
+from terrafix.models.mekf import REASONS, navigation_error_array
 
 
 class NavigationEvaluation(Evaluation):
@@ -52,8 +51,9 @@ class NavigationEvaluation(Evaluation):
 
     def _evaluate(self) -> None:
         estimate = self.estimate
-        turn = rotation_vector_array(product_array(estimate.q_mu, inverse_array(self.q_mu)))
-        error = np.concatenate([estimate.r_e - self.r_e, estimate.v_e - self.v_e, turn], axis=1)
+        error = navigation_error_array(
+            self.r_e, self.v_e, self.q_mu, estimate.r_e, estimate.v_e, estimate.q_mu
+        )
         variance = np.diagonal(estimate.P, axis1=1, axis2=2)
         sigma = np.sqrt(np.where(variance > 0.0, variance, np.nan))
         for i, quantity in enumerate(self.quantities):

@@ -28,9 +28,7 @@ class LastKnownState(Component):
         error = sigma * self.normals("error", 6)
         P = np.zeros((self.n_members, 6, 6))
         P[:, range(6), range(6)] = sigma**2
-        self.state.publish(
-            0.0, r_e=self.r_e + error[:, :3], v_e=self.v_e + error[:, 3:], P=P
-        )
+        self.state.publish(0.0, r_e=self.r_e + error[:, :3], v_e=self.v_e + error[:, 3:], P=P)
 
     def _step_impl(self, t: float, dt: float) -> None:
         """Say nothing more: GPS stays lost."""

@@ -58,7 +58,9 @@ class RecordedOrbit(Component):
                 f"  set {self.name}.orbit_file, or TERRAFIX_DATA to the folder with the data"
             ) from None
         except (OSError, ValueError) as error:
-            raise ConfigurationError(f"'{self.name}' cannot read its orbit file: {error}") from error
+            raise ConfigurationError(
+                f"'{self.name}' cannot read its orbit file: {error}"
+            ) from error
         start = float(self.setting("start"))
         if start >= ephemeris.t[-1]:
             raise ConfigurationError(

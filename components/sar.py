@@ -36,7 +36,9 @@ class SyntheticSarFix(SymbolicComponent):
     default_rate = Rate("8.2", offset="8.2")
 
     boresight = Choice(
-        BORESIGHTS, "true", doc="nominal: pixel where the misaligned antenna does not look (control)"
+        BORESIGHTS,
+        "true",
+        doc="nominal: pixel where the misaligned antenna does not look (control)",
     )
     look = Parameter(unit="rad", doc="off-nadir angle of the boresight, to the right")
     squint = Parameter(0.0, unit="rad", doc="forward angle of the boresight")

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.errors import ConfigurationError, WiringError, nearest
-from terrafix.cosim.noise import NormalStream
+from terrafix.cosim.noise import NormalBlocks, NormalStream
 from terrafix.cosim.parameters import Parameter, Setting
 from terrafix.cosim.ports import Capabilities, Declaration, Port, State
 
@@ -125,7 +125,7 @@ class Component:
         self._settings: dict[str, Any] = {}
         self._base: dict[str, Any] = {}
         self._environment: Environment | None = None
-        self._streams: dict[str, NormalStream] = {}
+        self._streams: dict[tuple[str, int], NormalBlocks] = {}
         self.step_index = 0
         declared = self.settings()
         for name, value in self._declared.items():
@@ -285,11 +285,12 @@ class Component:
         They depend on the root seed, the member, this component's path, the stream's name and
         the number of this component's step, and on nothing else.
         """
-        source = self._streams.get(stream)
+        source = self._streams.get((stream, n))
         if source is None:
             env = self.environment
-            source = self._streams[stream] = NormalStream(env.seed, env.path, stream, env.members)
-        return source.draw(self.step_index, n)
+            numbers = NormalStream(env.seed, env.path, stream, env.members)
+            source = self._streams[stream, n] = NormalBlocks(numbers, n)
+        return source.draw(self.step_index)
 
     def fail(self, mask: ArrayLike, reason: str) -> None:
         """Exclude the members in `mask` (n_members,) from here on, with a reason."""

@@ -28,6 +28,7 @@ from typing import Any
 import casadi as ca
 
 from terrafix.models.frames import earth_rate_cross
+from terrafix.models.batch import over_members
 from terrafix.models.gravity import gravity_acceleration
 from terrafix.models.model import Model, rk4
 from terrafix.models.quaternion import (
@@ -349,28 +350,28 @@ def _measurement(prior: Any, fix: Any, q_be: Any, q_sb: Any) -> Measurement:
     return Measurement(fix["y"], at(y), at(by_error), noise, fix["present"])
 
 
-def navigation_error_model() -> Model:
+def navigation_error(
+    r_e: Any, v_e: Any, q_mu: Any, r_e_hat: Any, v_e_hat: Any, q_mu_hat: Any
+) -> Any:
     """Error of an estimate as reported, estimate minus truth, in the coordinates of P.
+
+    Parameters
+    ----------
+    r_e, v_e : SX, shape (3,)
+        True position [m] and velocity [m/s].
+    q_mu : SX, shape (4,)
+        True misalignment.
+    r_e_hat, v_e_hat, q_mu_hat : SX
+        The estimates.
 
     Returns
     -------
-    Model
-        Inputs ``r_e``, ``v_e`` (3,), ``q_mu`` (4,), the truth, and ``estimate.r_e``, ``.v_e``,
-        ``.q_mu``. Output ``error`` (9,): position [m], velocity [m/s], misalignment [rad], the
-        last the rotation vector that takes the true to the estimated antenna axes.
+    SX, shape (9,)
+        Position [m], velocity [m/s], misalignment [rad]; the last is the rotation vector that
+        takes the true to the estimated antenna axes.
     """
-    truth, estimate = estimate_symbols("true"), estimate_symbols("estimate")
-    fields = ("r_e", "v_e", "q_mu")
-    turn = rotation_vector(product(estimate["q_mu"], inverse(truth["q_mu"])))
-    return Model(
-        "navigation_error",
-        inputs={
-            **{k: truth[k] for k in fields},
-            **{f"estimate.{k}": estimate[k] for k in fields},
-        },
-        outputs={
-            "error": ca.vertcat(
-                estimate["r_e"] - truth["r_e"], estimate["v_e"] - truth["v_e"], turn
-            )
-        },
-    )
+    turn = rotation_vector(product(q_mu_hat, inverse(q_mu)))
+    return ca.vertcat(r_e_hat - r_e, v_e_hat - v_e, turn)
+
+
+navigation_error_array = over_members(navigation_error, (3,), (3,), (4,), (3,), (3,), (4,))

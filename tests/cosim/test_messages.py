@@ -93,8 +93,7 @@ def test_queues_keep_every_message_in_order(toys, delay, unit):
 
     reader = Reader(rate=Rate(3))
     toys.fly(toys.wire({"send": toys.Sender(), "read": reader}, [LINK[0] + delay]), 9)
-    shift, scale = (1, 1) if delay else (0, 1)
-    scale = 1e-3 if unit == "km" else 1
+    shift, scale = 1 if delay else 0, 1e-3 if unit == "km" else 1
     for t, queued in reader.queues:
         expected = [k for k in (t - 2 - shift, t - 1 - shift, t - shift) if k > 0]
         assert [float(q["t"][0]) for q in queued] == expected

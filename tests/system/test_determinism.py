@@ -60,7 +60,9 @@ def test_kernels_of_both_kinds_agree(hundred, kernel, monkeypatch):
     alone = fly([0, 41])
     for name in ("evaluation.position_error", "evaluation.velocity_error", "evaluation.nees"):
         # 1e-6 m: float spacing at 7e6 m is 1e-9 m, amplified by 25 s and three corrections
-        np.testing.assert_allclose(alone[name], hundred[name].sel(member=[0, 41]), atol=1e-5, rtol=1e-5)
+        np.testing.assert_allclose(
+            alone[name], hundred[name].sel(member=[0, 41]), atol=1e-5, rtol=1e-5
+        )
 
 
 def test_a_killed_run_resumes_to_the_same_bytes(tmp_path):
