@@ -69,9 +69,15 @@ def check(system: System) -> Plan:
     except TerrafixError as error:
         raise SystemCheckError(system.name, [error]) from error
     if not flat.components:
-        problems.append(ConfigurationError("the system has no components"))
+        problems.append(
+            ConfigurationError(
+                "the system has no components\n"
+                "  add one: [component.NAME] with a type in its file, or add(...) in Python"
+            )
+        )
     for path, component in flat.components.items():
         missing = component.missing_settings()
+        refused = any(value is None for value in component._base.values())  # and reported
         for name in missing:
             kind = component.settings()[name].kind()
             problems.append(
@@ -81,7 +87,7 @@ def check(system: System) -> Plan:
             problems.append(
                 RateError(f'\'{path}\' has no rate\n  give it a period ("0.01 s") or hz ("100 Hz")')
             )
-        if not missing:
+        if not missing and not refused:
             attempt(component.validate)
         for port in component.ports.values():
             for field in port.fields.values():
@@ -203,10 +209,14 @@ def record_rate(flat: FlatSystem, record: Record) -> Rate:
     """
     owners = []
     for path in record.ports:
-        port = flat.port(path)
+        try:
+            port = flat.port(path)
+        except WiringError as error:
+            raise WiringError(f"record '{record.name}' names '{path}'\n  {error}") from error
         if port.is_input:
             raise WiringError(
-                f"record '{record.name}' names the input '{path}'; record the output that feeds it"
+                f"record '{record.name}' names the input '{path}'\n"
+                f"  {_feeding(flat, path)}"
             )
         strange = [f.dtype for f in port.fields.values() if np.dtype(f.dtype).kind not in "fiub"]
         if strange:
@@ -215,7 +225,10 @@ def record_rate(flat: FlatSystem, record: Record) -> Rate:
                 "records hold real numbers: publish real and imaginary parts"
             )
         if port.kind == "shared":
-            raise WiringError(f"record '{record.name}' names the shared port '{path}'; it may not")
+            raise WiringError(
+                f"record '{record.name}' names the shared port '{path}'\n"
+                "  records hold signals and messages, one value for each member"
+            )
         owners.append(flat.owner(path))
     if record.rate is not None:
         return record.rate
@@ -229,6 +242,11 @@ def record_rate(flat: FlatSystem, record: Record) -> Rate:
     if rate is None:
         raise RateError(f"record '{record.name}' watches a component without a rate")
     return rate
+
+
+def _feeding(flat: FlatSystem, path: str) -> str:
+    source = next((c.source for c in flat.connections if c.target == path), None)
+    return f"record the output that feeds it: '{source}'" if source else "only outputs are recorded"
 
 
 def _notes(flat: FlatSystem) -> Iterator[str]:

@@ -59,11 +59,12 @@ class Dispersion:
         """
         if self.kind not in KINDS:
             raise ConfigurationError(
-                f"dispersion '{self.name}' is of kind '{self.kind}'\n  {nearest(self.kind, KINDS)}"
+                f"dispersion '{self.name}' is of kind '{self.kind}'; it takes {' or '.join(KINDS)}"
             )
         if not self.targets:
             raise ConfigurationError(
-                f"dispersion '{self.name}' feeds no parameter; name some in to"
+                f"dispersion '{self.name}' feeds no parameter\n"
+                '  name one or more, as in to = ["orbit.r0_i"]'
             )
         found: list[Parameter] = []
         for target in self.targets:
@@ -91,12 +92,15 @@ class Dispersion:
                 )
         return first
 
-    def read_spread(self, components: dict[str, Component]) -> FloatArray:
-        """The spread as an array in the targets' unit; ConfigurationError if it cannot be one."""
+    def read_spread(self, components: dict[str, Component], *, bare: bool = True) -> FloatArray:
+        """The spread as an array in the targets' unit; ConfigurationError if it cannot be one.
+
+        `bare` allows numbers without a unit.
+        """
         parameter = self.parameter(components)
         like = Parameter(shape=parameter.shape, unit=parameter.unit, minimum=0.0)
         return like.read(
-            self.spread, where=f"{KINDS[self.kind]} of dispersion '{self.name}'", bare=True
+            self.spread, where=f"{KINDS[self.kind]} of dispersion '{self.name}'", bare=bare
         )
 
     def apply(

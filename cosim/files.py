@@ -46,7 +46,7 @@ from terrafix.cosim.errors import (
     WiringError,
     nearest,
 )
-from terrafix.cosim.parameters import Count, FilePath
+from terrafix.cosim.parameters import Count, FilePath, shown
 from terrafix.cosim.registry import component_entries, component_type
 from terrafix.cosim.system import Record, System
 
@@ -66,7 +66,13 @@ class _Load:
     folder: Path
     problems: list[TerrafixError] = field(default_factory=list)
     broken: set[str] = field(default_factory=set)  # components that could not be made
-    attempted: set[str] = field(default_factory=set)  # inputs whose connection was refused
+    refused: list[tuple[str, str]] = field(default_factory=list)  # connections, source and target
+    unread: bool = False  # connections were written that could not be read
+    withheld: set[str] = field(default_factory=set)  # parameters that a refused choice would set
+    bare: set[str] = field(default_factory=set)  # paths set without need of a unit
+
+    def add(self, text: str) -> None:
+        self.problems.append(ConfigurationError(text))
 
     def attempt(self, action: Any, *arguments: Any, **options: Any) -> Any:
         try:

@@ -11,6 +11,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from datetime import date, time
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar, overload
 
@@ -23,6 +24,15 @@ from terrafix.cosim.units import conversion_factor, split_quantity
 FloatArray = NDArray[np.float64]
 Value = TypeVar("Value")
 REQUIRED: Any = object()
+
+
+def shown(value: object) -> str:
+    """Show a value as it stands in a system file."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, date | time):
+        return value.isoformat()
+    return repr(value)
 
 
 class Setting(Declaration, Generic[Value]):
@@ -109,7 +119,7 @@ class Parameter(Setting[FloatArray]):
     def kind(self) -> str:
         """Describe what is accepted, for listings."""
         shape = "number" if not self.shape else f"array {self.shape}"
-        return f"{shape} [{self.unit_text()}]"
+        return shape if self.unit in ("1", "") else f"{shape} [{self.unit_text()}]"
 
     def read(self, value: Any, *, where: str, bare: bool = True) -> FloatArray:
         """Turn a number, array, or text with a unit into an array in the declared unit.
@@ -127,29 +137,29 @@ class Parameter(Setting[FloatArray]):
                     f"{where} is a table with {sorted(value)}; write {{ value = ..., unit = ... }}"
                 )
             value, unit = value["value"], value.get("unit")
+            if not isinstance(unit, str | None):
+                raise ConfigurationError(f"{where} has the unit {shown(unit)}; write it as text")
         if isinstance(value, str):
             text = value
             try:
                 value, unit = split_quantity(value)
             except ValueError:
                 raise ConfigurationError(
-                    f"{where} is '{text}', which is not a number with a unit\n"
-                    f"  it takes {self.kind()}: write {self._example()}"
+                    f"{where} is '{text}', which is not a number with a unit\n  {self._wanted()}"
                 ) from None
         if isinstance(value, bool):
-            raise ConfigurationError(f"{where} is {value}; it takes {self.kind()}")
+            raise ConfigurationError(f"{where} is {shown(value)}; {self._wanted()}")
         try:
             array = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ConfigurationError(f"{where} is {value!r}; it takes {self.kind()}") from None
+        except (TypeError, ValueError, OverflowError):
+            raise ConfigurationError(f"{where} is {shown(value)}; {self._wanted()}") from None
+        self._check_finite(array, where)
         if array.shape != self.shape:
             if array.ndim == 0 and self.shape and isinstance(self.unit, str):
                 array = np.full(self.shape, float(array))
             else:
-                raise ConfigurationError(
-                    f"{where} has shape {array.shape}; it takes {self.kind()}: "
-                    f"write {self._example()}"
-                )
+                what = f"has shape {array.shape}" if array.ndim else "is one number"
+                raise ConfigurationError(f"{where} {what}; {self._wanted()}")
         array = self._convert(array, unit, where=where, bare=bare)
         self._check_range(array, where)
         return array
@@ -159,15 +169,16 @@ class Parameter(Setting[FloatArray]):
     ) -> FloatArray:
         if unit is None:
             if not bare and self.unit not in ("1", "") and not np.all(array == 0.0):
-                raise ConfigurationError(
-                    f"{where} has no unit\n  it takes {self.kind()}: write {self._example()}"
-                )
+                raise ConfigurationError(f"{where} has no unit\n  {self._wanted()}")
             return array
         if not isinstance(self.unit, str):
             raise ConfigurationError(
                 f"{where} has elements of different units {self.unit_text()}; give bare SI numbers"
             )
-        factor = conversion_factor(unit, self.unit)
+        try:
+            factor = conversion_factor(unit, self.unit)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{where} is given in {unit}: {error}") from error
         if factor is None:
             raise ConfigurationError(
                 f"{where} is given in {unit}; it takes {self.kind()}\n"
@@ -175,28 +186,30 @@ class Parameter(Setting[FloatArray]):
             )
         return array * factor
 
-    def _example(self) -> str:
-        unit = "" if self.unit_text() in ("1", "") else f" {self.unit_text()}"
-        number = "1.0" if not self.shape else "[" + ", ".join(["1.0"] * self.shape[0]) + "]"
-        return f'"{number}{unit}"'
+    def _wanted(self) -> str:
+        """What is accepted, and how it is written."""
+        unit = f" {self.unit}" if isinstance(self.unit, str) and self.unit not in ("1", "") else ""
+        number = "1.0"
+        for extent in reversed(self.shape):
+            number = "[" + ", ".join([number] * extent) + "]"
+        return f'it takes {self.kind()}: write "{number}{unit}"'
+
+    def _check_finite(self, array: FloatArray, where: str) -> None:
+        if np.isnan(array).any() or (not self.infinite and np.isinf(array).any()):
+            raise ConfigurationError(f"{where} is {array.tolist()}; it must be finite")
 
     def _check_range(self, array: FloatArray, where: str) -> None:
+        self._check_finite(array, where)
+        unit = "" if self.unit in ("1", "") else f" {self.unit_text()}"
         bad: str | None = None
-        if np.isnan(array).any():
-            bad = "is not a number (NaN)"
-        elif not self.infinite and np.isinf(array).any():
-            bad = "is infinite"
-        elif self.positive and (array <= 0).any():
+        if self.positive and (array <= 0).any():
             bad = "must be positive"
         elif self.minimum is not None and (array < self.minimum).any():
-            bad = f"must be at least {self.minimum:g} {self.unit_text()}"
+            bad = f"must be at least {self.minimum:g}{unit}"
         elif self.maximum is not None and (array > self.maximum).any():
-            bad = f"must be at most {self.maximum:g} {self.unit_text()}"
+            bad = f"must be at most {self.maximum:g}{unit}"
         if bad:
-            shown = array.tolist()
-            if bad.startswith("must"):
-                raise ConfigurationError(f"{where} is {shown} {self.unit_text()}; it {bad}")
-            raise ConfigurationError(f"{where} = {shown} {bad}; give a finite number")
+            raise ConfigurationError(f"{where} is {array.tolist()}{unit}; it {bad}")
 
     def write(self, value: FloatArray) -> Any:
         """Write a value with its unit as text."""
@@ -225,7 +238,7 @@ class Count(Setting[int]):
         if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d+\s*", value):
             value = int(value)
         if isinstance(value, bool) or not isinstance(value, int):
-            raise ConfigurationError(f"{where} is {value!r}; it takes a whole number")
+            raise ConfigurationError(f"{where} is {shown(value)}; it takes a whole number")
         if value < self.minimum or (self.maximum is not None and value > self.maximum):
             upper = "" if self.maximum is None else f" and at most {self.maximum}"
             raise ConfigurationError(
@@ -242,7 +255,7 @@ class Flag(Setting[bool]):
         if isinstance(value, str) and value.strip().lower() in ("true", "false"):
             return value.strip().lower() == "true"
         if not isinstance(value, bool):
-            raise ConfigurationError(f"{where} is {value!r}; it takes true or false")
+            raise ConfigurationError(f"{where} is {shown(value)}; it takes true or false")
         return value
 
 
@@ -261,7 +274,9 @@ class Choice(Setting[str]):
         """Accept one of the options."""
         if not isinstance(value, str) or value not in self.options:
             hint = nearest(str(value), self.options)
-            raise ConfigurationError(f"{where} is {value!r}; it takes {self.kind()}\n  {hint}")
+            hint = f"\n  {hint}" if hint.startswith("did you mean") else ""
+            options = " or ".join(f'"{o}"' for o in self.options)
+            raise ConfigurationError(f"{where} is {shown(value)}; it takes {options}{hint}")
         return value
 
 
@@ -271,7 +286,7 @@ class Text(Setting[str]):
     def read(self, value: Any, *, where: str, bare: bool = True) -> str:  # noqa: ARG002 - no unit
         """Accept text."""
         if not isinstance(value, str):
-            raise ConfigurationError(f"{where} is {value!r}; it takes text")
+            raise ConfigurationError(f"{where} is {shown(value)}; it takes text")
         return value
 
 
@@ -286,7 +301,7 @@ class FilePath(Setting[Path]):
         if isinstance(value, Path):
             return value
         if not isinstance(value, str) or not value.strip():
-            raise ConfigurationError(f"{where} is {value!r}; it takes the path of a file")
+            raise ConfigurationError(f"{where} is {shown(value)}; it takes the path of a file")
 
         def expand(match: re.Match[str]) -> str:
             name = match[1] or match[3]

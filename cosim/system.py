@@ -63,6 +63,8 @@ class FlatSystem:
     def port(self, path: str) -> Port[Any]:
         """The port at ``"component.port"``; WiringError if there is none."""
         owner, _, name = path.rpartition(".")
+        if not owner:
+            raise WiringError(f"'{path}' is no port; write 'component.port'")
         if owner not in self.components:
             raise WiringError(
                 f"there is no component '{owner}' in '{path}'\n"
@@ -182,8 +184,17 @@ class System:
             If the delay is negative or not exact.
         """
         source_path, target_path = self._path(source), self._path(target)
-        _, source_port = self.resolve(source_path)
-        target_leaf, target_port = self.resolve(target_path)
+        wrong, found = [], []
+        for path in (source_path, target_path):
+            try:
+                found.append(self.resolve(path))
+            except WiringError as error:
+                wrong.append(f"  {error}")
+        if wrong:
+            raise WiringError(
+                "\n".join([f"cannot connect '{source_path}' to '{target_path}'", *wrong])
+            )
+        (_, source_port), (target_leaf, target_port) = found
         check_connection(source_path, source_port, target_path, target_port)
         for other in self.connections:
             if self.resolve(other.target)[0] == target_leaf:
@@ -194,7 +205,10 @@ class System:
                 )
         exact = seconds(delay, f"delay of '{source_path} -> {target_path}'")
         if exact < 0:
-            raise RateError(f"delay of '{source_path} -> {target_path}' is negative")
+            raise RateError(
+                f"delay of '{source_path} -> {target_path}' is negative\n"
+                "  a connection hands on what was published, never what will be"
+            )
         if exact and (target_port.kind == "shared" or target_port.window):
             raise WiringError(
                 f"cannot delay '{source_path} -> {target_path}': only signals and messages carry "

@@ -19,7 +19,9 @@ DIMENSIONLESS = ("", "1")
 def _registry() -> Any:
     import pint
 
-    return pint.UnitRegistry()
+    registry = pint.UnitRegistry()
+    registry.define("px = pixel")  # of an image; Pint's own px is a length, 1/96 inch
+    return registry
 
 
 @lru_cache(maxsize=1024)
@@ -62,7 +64,7 @@ def check_unit(text: str) -> None:
         _unit(text)
 
 
-_TRAILING = re.compile(r"\A\s*(\[.*\]|[^\s\[\]]+(?:\s*,\s*[^\s\[\],]+)*)\s*(.*?)\s*\Z", re.DOTALL)
+_TRAILING = re.compile(r"\A\s*(\[.*\]|[^\s\[\],]+(?:\s*,\s*[^\s\[\],]+)*)\s*(.*?)\s*\Z", re.DOTALL)
 
 
 def split_quantity(text: str) -> tuple[Any, str | None]:

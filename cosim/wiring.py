@@ -13,21 +13,26 @@ from terrafix.cosim.units import conversion_factor
 FloatArray = NDArray[np.float64]
 
 
-def describe(path: str, port: Port[Any]) -> list[str]:
-    """Describe a port in one line per field, for error messages and listings."""
-    side = "input" if port.is_input else "output"
-    kind = "" if port.kind == "signal" else f" {port.kind}"
-    lines = []
-    for name, field in port.fields.items():
-        label = f"{path}.{name}" if name else path
-        frame = f"frame {field.frame}" if field.frame else ""
-        shape = str(field.shape).replace("None", "any")
-        dtype = "" if np.dtype(field.dtype) == np.float64 else f"{np.dtype(field.dtype)} "
-        text = (
-            f"{label:<24} {side}{kind}  shape {shape:<8} {dtype}unit {field.unit_text():<8} {frame}"
-        )
-        lines.append("  " + text.rstrip())
-    return lines
+def describe(*ports: tuple[str, Port[Any]]) -> list[str]:
+    """Describe ports, given with their paths, in one line per field, column below column."""
+    rows = []
+    for path, port in ports:
+        side = "input" if port.is_input else "output"
+        kind = "" if port.kind == "signal" else f" {port.kind}"
+        for name, field in port.fields.items():
+            dtype = "" if np.dtype(field.dtype) == np.float64 else f" {np.dtype(field.dtype)}"
+            rows.append(
+                (
+                    f"{path}.{name}" if name else path,
+                    f"{side}{kind}",
+                    f"shape {field.shape}".replace("None", "any") + dtype,
+                    f"unit {field.unit_text()}",
+                    f"frame {field.frame}" if field.frame else "",
+                )
+            )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = ([f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)] for row in rows)
+    return ["  " + "  ".join(cells).rstrip() for cells in padded]
 
 
 def _field_problem(name: str, source: Field, target: Field) -> str | None:
@@ -118,5 +123,5 @@ def check_connection(
         problem = next((p for p in found if p), None)
     if problem:
         lines = [f"cannot connect '{source_path}' to '{target_path}'"]
-        lines += describe(source_path, source) + describe(target_path, target)
+        lines += describe((source_path, source), (target_path, target))
         raise WiringError("\n".join([*lines, f"  {problem}"]))

@@ -1,10 +1,9 @@
-r"""Is a filter's covariance that of its errors? Normalized squares and their bounds.
+r"""Is a filter's covariance that of its errors? Normalized squares and gates.
 
 .. math::
     \epsilon = e^T P^{-1} e
 
-is chi-square with :math:`n` degrees of freedom where the filter is consistent; the mean over
-:math:`N` members times :math:`N` is chi-square with :math:`N n`.
+is chi-square with :math:`n` degrees of freedom where the filter is consistent.
 
 References
 ----------
@@ -77,34 +76,6 @@ def normalized_square(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
                 below -= L[..., i, k] * L[..., j, k]
             L[..., i, j] = below / L[..., j, j]
     return np.where(valid, total, np.nan)
-
-
-def mean_bounds(dof: float, n_samples: int, probability: float = 0.95) -> tuple[float, float]:
-    """Two-sided bounds of the mean of independent chi-square samples.
-
-    Parameters
-    ----------
-    dof : float
-        Degrees of freedom of one sample.
-    n_samples : int
-        Samples in the mean.
-    probability : float
-        Of the mean lying between the bounds.
-
-    Raises
-    ------
-    ValueError
-        If there is no sample, or `probability` is not between 0 and 1.
-    """
-    if n_samples < 1:
-        raise ValueError(f"a mean wants one sample at least, got {n_samples}")
-    if not 0 < probability < 1:
-        raise ValueError(f"probability must be between 0 and 1, got {probability}")
-    from scipy.stats import chi2
-
-    tail = (1 - probability) / 2
-    lower, upper = chi2.ppf([tail, 1 - tail], dof * n_samples) / n_samples
-    return float(lower), float(upper)
 
 
 def gate_thresholds(probability: float, max_dof: int = 4) -> FloatArray:

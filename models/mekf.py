@@ -27,8 +27,8 @@ from typing import Any
 
 import casadi as ca
 
-from terrafix.models.frames import earth_rate_cross
 from terrafix.models.batch import over_members
+from terrafix.models.frames import earth_rate_cross
 from terrafix.models.gravity import gravity_acceleration
 from terrafix.models.model import Model, rk4
 from terrafix.models.quaternion import (

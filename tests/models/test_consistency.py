@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from terrafix.models.consistency import gate_thresholds, mean_bounds, normalized_square
+from terrafix.models.consistency import gate_thresholds, normalized_square
 
 
 def ensemble(n_members, n=9, seed=0):
@@ -54,20 +54,6 @@ def test_shapes_must_agree():
         normalized_square(np.zeros((3, 4)), np.zeros((3, 3, 3)))
 
 
-@pytest.mark.parametrize(
-    ("dof", "n", "expected"),
-    [
-        (9, 100, (8.19, 9.85)),
-        (9, 300, (8.53, 9.49)),
-        (4, 100, (3.46, 4.57)),
-        (4, 7200, (3.935, 4.066)),
-    ],
-)
-def test_bounds_of_ensemble_means(dof, n, expected):
-    """Tabulated values, to their digits."""
-    np.testing.assert_allclose(mean_bounds(dof, n), expected, atol=6e-3)
-
-
 def test_gates_of_one_to_four_degrees():
     """Tables of chi-square at 99 %."""
     np.testing.assert_allclose(gate_thresholds(0.99), [6.635, 9.210, 11.345, 13.277], atol=6e-4)
@@ -75,10 +61,6 @@ def test_gates_of_one_to_four_degrees():
 
 
 def test_impossible_arguments_are_refused():
-    with pytest.raises(ValueError, match="one sample at least"):
-        mean_bounds(4, 0)
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        mean_bounds(4, 10, 1.0)
     with pytest.raises(ValueError, match=r"in \(0, 1\]"):
         gate_thresholds(0.0)
 

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from terrafix.models.attitude import lvlh_attitude_model
 from terrafix.models.earth import EARTH
 from terrafix.models.gravity import j2_acceleration
-from terrafix.models.mekf import mekf_predict_model, navigation_error_model, transition_matrix
+from terrafix.models.mekf import mekf_predict_model, navigation_error_array, transition_matrix
 from terrafix.models.orbit import orbit_model
 from terrafix.models.quaternion import from_rotation_vector_array, product_array
 
@@ -167,14 +167,10 @@ def test_start_is_the_last_known_state(start_e, constants):
 
 def test_reported_error_is_estimate_minus_truth():
     truth, turn = from_rotation_vector_array([1.0, 2.0, -1.0]), np.array([0.01, -0.02, 0.03])
-    error = navigation_error_model()(
-        r_e=[1, 2, 3],
-        v_e=[4, 5, 6],
-        q_mu=truth,
-        estimate_r_e=[11, 2, 3],
-        estimate_v_e=[4, 5, 5],
-        estimate_q_mu=product_array(from_rotation_vector_array(turn), truth),
-    )["error"]
+    estimate = product_array(from_rotation_vector_array(turn), truth)
+    error = navigation_error_array(
+        [1.0, 2, 3], [4.0, 5, 6], truth, [11.0, 2, 3], [4.0, 5, 5], estimate
+    )
     np.testing.assert_allclose(error, [10, 0, 0, 0, 0, -1, *turn], atol=1e-15)
 
 
