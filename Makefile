@@ -2,13 +2,14 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+RUN := $(VENV)/.installed
+STAMP := $(VENV)/.installed-test
 OUT := .demo
 
 .PHONY: demo test quick lint types campaigns benchmarks clean
 
 ## the main job: a spacecraft that has lost GPS finds itself again (100 members, table and picture)
-demo: $(STAMP)
+demo: $(RUN)
 	@mkdir -p $(OUT)
 	$(BIN)/terrafix run examples/spacecraft_sar_open_loop.toml \
 	    --out $(OUT)/open_loop.nc --plot $(OUT)/open_loop.png
@@ -39,8 +40,12 @@ campaigns: $(STAMP)
 benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/run.py
 
-$(STAMP): pyproject.toml
+$(RUN): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install -q --disable-pip-version-check -e .
+	@touch $@
+
+$(STAMP): $(RUN)
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[test]'
 	@touch $@
 

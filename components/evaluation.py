@@ -46,7 +46,7 @@ class NavigationEvaluation(Evaluation):
     def _initialize_impl(self) -> None:
         self._evaluate()
 
-    def _step_impl(self, t: float, dt: float) -> None:  # noqa: ARG002 - the instant alone counts
+    def _step_impl(self, t: float, dt: float) -> None:
         self._evaluate()
 
     def _evaluate(self) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.errors import CheckpointError
 from terrafix.cosim.ports import Field, Port
 
@@ -158,7 +159,8 @@ class MessageWriter:
 
     def __init__(self, port: Port[Any], n_members: int, active: Mask) -> None:
         self.slot = MessageSlot(port.fields, n_members)
-        self._capacity = max((f.fixed_shape[0] for f in port.fields.values() if f.ragged), default=0)
+        ragged = (f.fixed_shape[0] for f in port.fields.values() if f.ragged)
+        self._capacity = max(ragged, default=0)
         self._name = port.name
         self._active = active
         self._draft: MessageSlot | None = None

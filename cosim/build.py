@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.buffers import (
     BundleView,
     MessageReader,
@@ -279,9 +280,7 @@ def _window_capacity(source: Rate | None, consumer: Rate | None) -> int:
     return math.ceil(longest / source.period) + 1
 
 
-def _reads_in_place(
-    place: int, source_place: int, rate: Rate | None, source: Rate | None
-) -> bool:
+def _reads_in_place(place: int, source_place: int, rate: Rate | None, source: Rate | None) -> bool:
     """Whether a start-read may look at the source's memory when its component steps.
 
     It may if the source has not stepped since the start of the consumer's step: it steps after

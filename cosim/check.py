@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 
 import numpy as np
+
 from terrafix.cosim.clock import Rate, base_step, text_seconds
 from terrafix.cosim.errors import (
     ConfigurationError,
@@ -179,7 +181,7 @@ def _too_fast(flat: FlatSystem, grid: Fraction) -> Iterator[TerrafixError]:
     for what, rate in timed:
         if rate is None or rate.times is None:
             continue
-        for early, late in zip(rate.times, rate.times[1:], strict=False):
+        for early, late in pairwise(rate.times):
             if late - early < grid:
                 yield RateError(
                     f"{what} has the times {text_seconds(early)} s and {text_seconds(late)} s, "
@@ -215,8 +217,7 @@ def record_rate(flat: FlatSystem, record: Record) -> Rate:
             raise WiringError(f"record '{record.name}' names '{path}'\n  {error}") from error
         if port.is_input:
             raise WiringError(
-                f"record '{record.name}' names the input '{path}'\n"
-                f"  {_feeding(flat, path)}"
+                f"record '{record.name}' names the input '{path}'\n  {_feeding(flat, path)}"
             )
         strange = [f.dtype for f in port.fields.values() if np.dtype(f.dtype).kind not in "fiub"]
         if strange:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from terrafix.cosim.errors import CheckpointError
 from terrafix.cosim.record import write_atomically
 
@@ -68,12 +69,12 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             f"there is no checkpoint '{path}'\n  write one with --checkpoint-every SECONDS"
         )
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
             tree = json.loads(bytes(stored["tree"]))
             arrays = {k: stored[k] for k in stored.files if k != "tree"}
     except Exception as error:  # a damaged file may fail in any way
         raise CheckpointError(
-            f"'{path}' is damaged or no checkpoint: {error}\n  start the run again without --resume"
+            f"'{path}' is damaged or no checkpoint\n  start the run again without --resume"
         ) from error
     schema = tree.get("schema") if isinstance(tree, dict) else None
     if schema != SCHEMA:

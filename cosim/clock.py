@@ -13,16 +13,24 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
+from itertools import pairwise
 
 from terrafix.cosim.errors import RateError
 
 Exact = int | str | Fraction | Decimal
 """What is accepted as an exact number of seconds or hertz."""
 
-_SECONDS = {"": 1, "s": 1, "ms": Fraction(1, 1000), "us": Fraction(1, 10**6), "min": 60, "h": 3600}
-_HERTZ = {"": 1, "hz": 1, "khz": 1000, "mhz": 10**6}
+_SECONDS: dict[str, int | Fraction] = {
+    "": 1,
+    "s": 1,
+    "ms": Fraction(1, 1000),
+    "us": Fraction(1, 10**6),
+    "min": 60,
+    "h": 3600,
+}
+_HERTZ: dict[str, int | Fraction] = {"": 1, "Hz": 1, "kHz": 1000, "MHz": 10**6}
 _NUMBER = re.compile(
-    r"\s*([+-]?(?:\d+/\d+|(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?))\s*([A-Za-z]*)\s*\Z"
+    r"\s*([+-]?(?:\d+/\d+|(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?))\s*([A-Za-z]*)\s*\Z"
 )
 
 
@@ -32,6 +40,13 @@ def _decimal_hint(value: float) -> str:
     if near.denominator == 1:
         return f'write {near.numerator} or "{near.numerator}"'
     return f'write "{text}" (exact) or "{near.numerator}/{near.denominator}"'
+
+
+def _scale(unit: str, units: dict[str, int | Fraction]) -> int | Fraction | None:
+    """Factor of a unit; its case matters only where it is mixed: mHz is no MHz."""
+    if unit in units or not (unit.islower() or unit.isupper()):
+        return units.get(unit)
+    return {u.lower(): scale for u, scale in units.items()}.get(unit.lower())
 
 
 def _exact(value: object, what: str, units: dict[str, int | Fraction], kind: str) -> Fraction:
@@ -49,11 +64,12 @@ def _exact(value: object, what: str, units: dict[str, int | Fraction], kind: str
         )
     if isinstance(value, str):
         match = _NUMBER.match(value)
-        if match and match[2].lower() in units:
+        scale = _scale(match[2], units) if match else None
+        if match and scale is not None:
             number = match[1]
             if number.endswith("/0") or re.search(r"/0+\Z", number):
                 raise RateError(f"{what} is '{value}': division by zero")
-            return Fraction(number) * units[match[2].lower()]
+            return Fraction(number) * scale
         accepted = ", ".join(u for u in units if u)
         raise RateError(
             f"{what} is '{value}', which is not {kind}\n"
@@ -161,15 +177,13 @@ class Rate:
             exact_times = tuple(seconds(t, "time") for t in times)
             if not exact_times:
                 raise RateError("times is empty; give at least one time")
-            if exact_times[0] < 0 or any(
-                b <= a for a, b in zip(exact_times, exact_times[1:], strict=False)
-            ):
+            if exact_times[0] < 0 or any(b <= a for a, b in pairwise(exact_times)):
                 raise RateError("times must be increasing and not negative")
         if exact_period is not None and exact_period <= 0:
-            raise RateError(f"period is {period} s; it must be positive")
+            raise RateError(f"period is {text_seconds(exact_period)} s; it must be positive")
         exact_offset = seconds(offset, "offset")
         if exact_offset < 0:
-            raise RateError(f"offset is {offset} s; it must not be negative")
+            raise RateError(f"offset is {text_seconds(exact_offset)} s; it must not be negative")
         if exact_times is not None and exact_offset:
             raise RateError("an offset goes with a period, not with a list of times")
         object.__setattr__(self, "period", exact_period)

@@ -14,11 +14,13 @@ A component reaches for nothing but its own ports, parameters, states and `norma
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.errors import ConfigurationError, WiringError, nearest
 from terrafix.cosim.noise import NormalBlocks, NormalStream
@@ -27,12 +29,8 @@ from terrafix.cosim.ports import Capabilities, Declaration, Port, State
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-RESERVED = frozenset(
-    {
-        *("type", "rate", "period", "offset", "times", "name", "doc", "file"),  # in system files
-        *("ports", "step_index", "kernel"),  # attributes of every component
-    }
-)
+ATTRIBUTES = frozenset({"name", "rate", "ports", "step_index", "kernel"})  # of every component
+KEYS = frozenset({"type", "period", "offset", "times", "doc", "file"})  # of its table in a file
 
 
 def _own(base: type) -> bool:
@@ -110,7 +108,9 @@ class Component:
                     declared[name] = value
                 elif name in declared:
                     del declared[name]  # a subclass took the name for something else
-        clash = (set(declared) & RESERVED) | {n for n in declared if n.startswith("_")}
+        settings = {n for n, d in declared.items() if isinstance(d, Setting)}
+        clash = (set(declared) & ATTRIBUTES) | (settings & KEYS)
+        clash |= {n for n in declared if n.startswith("_")}
         clash |= {n for n in declared for base in cls.__mro__ if n in vars(base) and _own(base)}
         if clash:
             raise TypeError(f"{cls.__name__} declares reserved names {sorted(clash)}")
@@ -299,7 +299,7 @@ class Component:
     def get_state(self) -> dict[str, Any]:
         """Arrays and plain values that reproduce this component."""
         saved: dict[str, Any] = {name: array.copy() for name, array in self._states.items()}
-        extra = self._extra_state()
+        extra = deepcopy(self._extra_state())
         return {"states": saved, "step_index": self.step_index, "extra": extra}
 
     def set_state(self, saved: dict[str, Any]) -> None:
@@ -307,7 +307,7 @@ class Component:
         for name, array in saved["states"].items():
             self._states[name][...] = array
         self.step_index = int(saved["step_index"])
-        self._set_extra_state(saved["extra"])
+        self._set_extra_state(deepcopy(saved["extra"]))
 
     def _extra_state(self) -> dict[str, Any]:
         """State that is not declared: a flat dict of arrays, numbers and texts."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.errors import ConfigurationError, nearest
 from terrafix.cosim.noise import NormalStream
 from terrafix.cosim.parameters import Parameter

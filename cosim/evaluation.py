@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.component import Component
 
 FloatArray = NDArray[np.float64]
@@ -65,14 +66,17 @@ def sample_sigma(errors: FloatArray) -> FloatArray:
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = filled.sum(axis=1) / n
         deviation = np.where(valid, errors - mean[:, None], 0.0)
-        return np.where(n > 1, np.sqrt((deviation**2).sum(axis=1) / (n - 1)), np.nan)
+        variance = (deviation**2).sum(axis=1) / (n - 1)
+        sigma: FloatArray = np.where(n > 1, np.sqrt(variance), np.nan)
+        return sigma
 
 
 def member_mean(values: FloatArray) -> FloatArray:
     """Mean over members (axis 1), NaN members left out; NaN where none is left."""
     valid = np.isfinite(values)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(valid, values, 0.0).sum(axis=1) / valid.sum(axis=1)
+        mean: FloatArray = np.where(valid, values, 0.0).sum(axis=1) / valid.sum(axis=1)
+        return mean
 
 
 def root_mean_square(values: FloatArray) -> FloatArray:

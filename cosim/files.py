@@ -29,13 +29,24 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from terrafix.cosim.check import check
-from terrafix.cosim.clock import Rate, text_seconds
+from terrafix.cosim.choices import (
+    TABLES,
+    TIMING,
+    TOP,
+    Settings,
+    Value,
+    choose,
+    override,
+    refuse_parameter,
+    refuse_strange,
+    try_others,
+)
+from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component
 from terrafix.cosim.dispersion import KINDS, Dispersion
 from terrafix.cosim.errors import (
@@ -46,42 +57,14 @@ from terrafix.cosim.errors import (
     WiringError,
     nearest,
 )
+from terrafix.cosim.loading import Load
 from terrafix.cosim.parameters import Count, FilePath, shown
 from terrafix.cosim.registry import component_entries, component_type
-from terrafix.cosim.system import Record, System
+from terrafix.cosim.system import System
 
 SCHEMA = "terrafix-system/1"
-TOP = ("schema", "name", "doc", "duration", "members", "seed")
-TABLES = ("component", "wiring", "expose", "record", "dispersion", "choice")
-TIMING = ("rate", "period", "offset", "times")
-Settings = Sequence[tuple[str, str]]
-"""(path, text) pairs as given with ``--set``."""
 _CONNECTION = re.compile(r"\s*([\w.]+)\s*->\s*([\w.]+)\s*(?:\(\s*delay\s+([^)]+?)\s*\))?\s*\Z")
-
-
-@dataclass
-class _Load:
-    """One file being read: what was built and what was wrong."""
-
-    folder: Path
-    problems: list[TerrafixError] = field(default_factory=list)
-    broken: set[str] = field(default_factory=set)  # components that could not be made
-    refused: list[tuple[str, str]] = field(default_factory=list)  # connections, source and target
-    unread: bool = False  # connections were written that could not be read
-    withheld: set[str] = field(default_factory=set)  # parameters that a refused choice would set
-    bare: set[str] = field(default_factory=set)  # paths set without need of a unit
-
-    def add(self, text: str) -> None:
-        self.problems.append(ConfigurationError(text))
-
-    def attempt(self, action: Any, *arguments: Any, **options: Any) -> Any:
-        try:
-            return action(*arguments, **options)
-        except SystemCheckError as error:
-            self.problems.extend(error.problems)
-        except TerrafixError as error:
-            self.problems.append(error)
-        return None
+_PORT = re.compile(r"[A-Za-z]\w*(?:\.\w+)+")
 
 
 def read_system(path: str | Path, settings: Settings = ()) -> System:
@@ -97,57 +80,66 @@ def read_system(path: str | Path, settings: Settings = ()) -> System:
     Raises
     ------
     ConfigurationError
-        If the file is absent or is not TOML.
+        If the file is absent, is not TOML, or is of another schema.
     SystemCheckError
         With every mistake in it.
     """
     path = Path(path)
-    system, load = _load(path, settings)
+    system, load = _load((path,), settings)
     problems = list(load.problems)
     try:
         check(system)
     except SystemCheckError as error:
         said = {str(p) for p in problems}
-        for problem in error.problems:
-            text = str(problem)
-            follows = any(f"input '{target}'" in text for target in load.attempted) or (
-                not system.nodes and problems
-            )
-            if text not in said and not follows:
-                problems.append(problem)
+        problems += [
+            p for p in error.problems if str(p) not in said and not load.follows(p, system)
+        ]
     if problems:
         raise SystemCheckError(system.name, problems, file=str(path))
     return system
 
 
-def _load(path: Path, settings: Settings) -> tuple[System, _Load]:
+def _load(files: tuple[Path, ...], settings: Settings) -> tuple[System, Load]:
+    path = files[-1]
     content = _parse(path)
-    load = _Load(path.parent)
-    _refuse_unknown(load, content, (*TOP, *TABLES), "key")
+    load = Load(files)
     schema = content.get("schema")
-    if schema != SCHEMA:
-        load.problems.append(
-            ConfigurationError(
-                f"'{path}' has schema {schema!r}; this version reads {SCHEMA!r}\n"
-                f'  write schema = "{SCHEMA}" first, or convert the file'
-            )
+    if schema is None:
+        load.refuse(f"'{path}' has no schema\n  write schema = \"{SCHEMA}\" first")
+    elif schema != SCHEMA:
+        raise ConfigurationError(
+            f"'{path}' has schema {shown(schema)}; this version reads '{SCHEMA}'\n"
+            "  read it with the version of terrafix that it was written for, or convert it"
         )
-    chosen, rest = _choose(load, _table(load, content, "choice"), settings)
+    for key in load.refuse_unknown(content, (*TOP, *TABLES)):
+        # what stands in a table of another name is not there, but was meant to be
+        load.broken |= set(content[key]) if isinstance(content[key], dict) else set()
+        load.unread |= "wiring" not in content
+    choices = load.tables(content, "choice")
+    chosen, others = choose(load, choices, settings)
+    given = [(k, v, False) for k, v in settings if k not in choices]
+    settable = TOP[1:]
     top = {k: content[k] for k in TOP if k in content}
-    own = {k: v for k, v in rest if k in TOP}
-    system = _make(load, top | own, path)
-    values: list[tuple[str, Any, str | None]] = [
-        *((k, v, "file") for k, v in chosen),
-        *((k, v, None) for k, v in rest if k not in TOP),
-    ]
-    nested = _components(load, system, _table(load, content, "component"), values)
-    overrides = _overrides(load, content, [v for v in values if v[0].split(".")[0] in TABLES])
-    _wire(load, system, _table(load, content, "wiring"))
-    for name, target in _table(load, content, "expose").items():
-        load.attempt(system.expose, name, str(target))
-    _records(load, system, overrides["record"])
-    _dispersions(load, system, overrides["dispersion"])
-    load.attempted |= nested
+    system = _make(load, top | {k: v for k, v, _ in given if k in settable}, path)
+    values = [*chosen, *((k, v, f) for k, v, f in given if k not in settable)]
+    components = load.tables(content, "component")
+    refuse_strange(load, values, components, choices)
+    for name, table in components.items():
+        mine = [(k.removeprefix(f"{name}."), *v) for k, *v in values if k.startswith(f"{name}.")]
+        if table.get("type") == "system":
+            _nested(load, system, name, table, mine)
+        else:
+            _component(load, system, name, table, mine)
+    refuse_strange(load, others, components, choices)
+    try_others(load, system, others)
+    observing = {kind: load.tables(content, kind) for kind in ("record", "dispersion")}
+    override(load, observing, [v for v in values if v[0].split(".")[0] in TABLES])
+    _wire(load, system, load.table(content, "wiring"))
+    for name, target in load.table(content, "expose").items():
+        if not load.is_lost([str(target)]):
+            load.attempt(_expose, system, name, target)
+    _records(load, system, observing["record"])
+    _dispersions(load, system, observing["dispersion"])
     return system, load
 
 
@@ -155,68 +147,35 @@ def _parse(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        near = nearest(path.name, [p.name for p in path.parent.glob("*.toml")], what="there are")
+        there = [p.name for p in path.parent.glob("*.toml")]
+        near = nearest(path.name, there, what="system files there")
+        if not path.parent.is_dir():
+            near = f"there is no folder '{path.parent}' either"
         raise ConfigurationError(f"there is no system file '{path}'\n  {near}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"cannot read system file '{path}': {error}") from error
+    except IsADirectoryError:
+        raise ConfigurationError(
+            f"'{path}' is a folder; name a system file (.toml) in it"
+        ) from None
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(
+            f"'{path}' is no system file: it is not text in UTF-8\n  name a .toml file"
+        ) from error
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot read system file '{path}': {error.strerror or error}"
+        ) from error
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigurationError(f"'{path}' is not TOML: {error}") from error
+        message = f"'{path}' is not TOML: {error}"
+        where = re.search(r"at line (\d+)", str(error))
+        line = text.splitlines()[int(where[1]) - 1].strip()[:80] if where else ""
+        if where and line.isprintable():
+            message += f"\n  line {where[1]}: {line}"
+        raise ConfigurationError(message) from error
 
 
-def _table(load: _Load, content: Mapping[str, Any], name: str) -> dict[str, Any]:
-    value = content.get(name, {})
-    if not isinstance(value, dict):
-        load.problems.append(ConfigurationError(f"'{name}' is {value!r}; it is a table [{name}]"))
-        return {}
-    return value
-
-
-def _refuse_unknown(
-    load: _Load, table: Mapping[str, Any], known: Iterable[str], what: str, where: str = ""
-) -> None:
-    known = list(known)
-    for key in table:
-        if key not in known:
-            prefix = f"{where}: " if where else ""
-            load.problems.append(
-                ConfigurationError(
-                    f"{prefix}there is no {what} '{key}'\n  {nearest(key, known, what=f'{what}s')}"
-                )
-            )
-
-
-def _choose(
-    load: _Load, choices: Mapping[str, Any], settings: Settings
-) -> tuple[list[tuple[str, Any]], list[tuple[str, str]]]:
-    """Settings of the chosen options, and the settings that choose nothing."""
-    picked = {k: v for k, v in settings if k in choices}
-    rest = [(k, v) for k, v in settings if k not in choices]
-    values: list[tuple[str, Any]] = []
-    for name, table in choices.items():
-        options = {k: v for k, v in table.items() if isinstance(v, dict)}
-        _refuse_unknown(
-            load,
-            {k: v for k, v in table.items() if k not in options},
-            ("default", "doc"),
-            "key",
-            f"choice '{name}'",
-        )
-        choice = picked.get(name, table.get("default"))
-        if choice not in options:
-            load.problems.append(
-                ConfigurationError(
-                    f"choice '{name}' is {choice!r}; it takes {' | '.join(options)}\n"
-                    f"  {nearest(str(choice), options)}"
-                )
-            )
-            continue
-        values += [(k, v) for k, v in options[choice].items() if k != "doc"]
-    return values, rest
-
-
-def _make(load: _Load, top: Mapping[str, Any], path: Path) -> System:
+def _make(load: Load, top: Mapping[str, Any], path: Path) -> System:
     name = top.get("name", path.stem)
     system: System | None = load.attempt(System, name, doc=str(top.get("doc", "")))
     if system is None:
@@ -235,312 +194,200 @@ def _make(load: _Load, top: Mapping[str, Any], path: Path) -> System:
 # ---------------------------------------------------------------------- components
 
 
-def _components(
-    load: _Load,
-    system: System,
-    tables: Mapping[str, Any],
-    values: list[tuple[str, Any, str | None]],
-) -> set[str]:
-    """Make components with everything that is set on them; inputs wired badly inside."""
-    suppressed: set[str] = set()
-    for name, table in tables.items():
-        if not isinstance(table, dict):
-            load.problems.append(
-                ConfigurationError(f"'component.{name}' is {table!r}; it is a table")
-            )
-            load.broken.add(name)
-            continue
-        mine = [
-            (k.removeprefix(f"{name}."), v, origin)
-            for k, v, origin in values
-            if k.startswith(f"{name}.")
-        ]
-        if table.get("type") == "system":
-            suppressed |= _nested(load, system, name, table, mine)
-        else:
-            _component(load, system, name, table, mine)
-    for key, _, _ in values:
-        head = key.split(".")[0]
-        if head not in tables and head not in TABLES:
-            load.problems.append(
-                ConfigurationError(
-                    f"cannot set '{key}': there is no '{head}'\n"
-                    f"  {nearest(head, [*tables, *TOP, 'record', 'dispersion'], what='there are')}"
-                )
-            )
-    return suppressed
-
-
 def _nested(
-    load: _Load,
-    system: System,
-    name: str,
-    table: Mapping[str, Any],
-    values: list[tuple[str, Any, str | None]],
-) -> set[str]:
-    _refuse_unknown(load, table, ("type", "file", "doc"), "key", f"'{name}'")
+    load: Load, system: System, name: str, table: Mapping[str, Any], values: list[Value]
+) -> None:
+    load.refuse_unknown(table, ("type", "file", "doc"), f"'{name}'")
+    load.broken.add(name)
     file = load.attempt(FilePath().read, table.get("file", ""), where=f"'{name}.file'")
     if file is None:
-        load.broken.add(name)
-        return set()
-    text = [(k, v if isinstance(v, str) else str(v)) for k, v, _ in values]
-    loaded = load.attempt(_load, load.folder / file, text)
-    if loaded is None or load.attempt(system.add, loaded[0], name) is None:
-        load.broken.add(name)
-        return set()
-    load.problems += loaded[1].problems
-    return {f"{name}.{target}" for target in loaded[1].attempted}
+        return
+    path = load.folder / file
+    if path.resolve() in [f.resolve() for f in load.files]:
+        load.refuse(f"'{name}' is the system '{path}', which contains it\n  nest another file")
+        return
+    try:
+        inner, its_load = _load((*load.files, path), [(k, _text(v)) for k, v, _ in values])
+    except TerrafixError as error:
+        load.problems.append(type(error)(f"'{name}': {error}"))
+        return
+    load.include(its_load, name)
+    if load.attempt(system.add, inner, name) is not None:
+        load.broken.discard(name)
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else shown(value)
 
 
 def _component(
-    load: _Load,
-    system: System,
-    name: str,
-    table: Mapping[str, Any],
-    values: list[tuple[str, Any, str | None]],
+    load: Load, system: System, name: str, table: Mapping[str, Any], values: list[Value]
 ) -> None:
     kind = table.get("type")
     if not isinstance(kind, str):
+        what = "no type" if kind is None else f"the type {shown(kind)}, which is no name"
         near = nearest("", component_entries(), what="component types")
-        load.problems.append(ConfigurationError(f"'{name}' has no type\n  {near}"))
+        load.refuse(f"'{name}' has {what}\n  {near}")
         load.broken.add(name)
         return
     try:
         made = component_type(kind)()
-        system.add(made, name)
     except TerrafixError as error:
         load.problems.append(type(error)(f"'{name}': {error}"))
         load.broken.add(name)
         return
+    if load.attempt(system.add, made, name) is None:
+        load.broken.add(name)
+        return
     timing = {k: table[k] for k in TIMING if k in table}
     given = {k: v for k, v in table.items() if k not in (*TIMING, "type", "doc")}
+    refused = 0
     for key, value in given.items():
-        _set(load, made, key, value, from_file=True)
-    for key, value, origin in values:
+        refused += not _set(load, made, key, value, from_file=True)
+    for key, value, from_file in values:
         if key in TIMING:
-            if key in ("rate", "period", "times"):
+            if key != "offset":
                 timing = {k: v for k, v in timing.items() if k == "offset" and key != "times"}
             timing[key] = value
         else:
-            _set(load, made, key, value, from_file=origin == "file")
-    rate = load.attempt(_rate, timing, f"'{name}'")
-    made.rate = rate or made.rate
-    load.attempt(made.prepare)
+            refused += not _set(load, made, key, value, from_file=from_file)
+    for key in made.missing_settings():
+        if f"{name}.{key}" in load.withheld:
+            made._base[key] = None
+            refused += 1
+    made.rate = load.attempt(_rate, timing, f"'{name}'") or made.rate
+    if not refused and not made.missing_settings():
+        load.attempt(made.prepare)
+    elif type(made).prepare is not Component.prepare:
+        load.broken.add(name)  # its ports depend on its parameters
 
 
-def _set(load: _Load, component: Component, key: str, value: Any, *, from_file: bool) -> None:
+def _set(load: Load, component: Component, key: str, value: Any, *, from_file: bool) -> bool:
+    """Set a parameter; False if it was refused, which is noted, and not again as missing."""
     settings = component.settings()
     if key not in settings:
-        load.problems.append(
-            ConfigurationError(
-                f"'{component.name}' has no parameter '{key}'\n"
-                f"  {nearest(key, [*settings, *TIMING], what='its parameters')}"
-            )
-        )
-        return
-    setting = settings[key]
+        refuse_parameter(load, component, key)
+        return False
     before = len(load.problems)
     load.attempt(component._set, key, value, bare=not from_file)
     if len(load.problems) > before:
-        # a value that was refused must not be reported again as missing
-        component._base.setdefault(key, None)
-    elif isinstance(setting, FilePath) and from_file:
+        component._base[key] = None
+        return False
+    if isinstance(settings[key], FilePath) and from_file:
         file = component.setting(key)
         component._settings[key] = component._base[key] = load.folder / file
+    return True
 
 
 def _rate(timing: Mapping[str, Any], where: str) -> Rate | None:
     if not timing:
         return None
     options = dict(timing)
+    kinds = [k for k in options if k != "offset"]
+    if not kinds:
+        raise RateError(f"{where} has an offset but no period\n  give it a period or a rate too")
+    if len(kinds) > 1:
+        raise RateError(f"{where} has {' and '.join(kinds)}\n  give one of them")
     if "rate" in options:
         options["hz"] = options.pop("rate")
-    if isinstance(options.get("times"), str):
-        options["times"] = [t for t in re.split(r"[\s,\[\]\"']+", options["times"]) if t]
+    times = options.get("times")
+    if isinstance(times, str):
+        options["times"] = [t for t in re.split(r"[\s,\[\]\"']+", times) if t]
+    elif times is not None and not isinstance(times, list):
+        raise RateError(f'{where}: times is {shown(times)}; write a list, ["0 s", "10 s"]')
     try:
         return Rate(**options)
     except RateError as error:
-        raise RateError(f"{where} {error}") from error
+        raise RateError(f"{where}: {error}") from error
 
 
 # ---------------------------------------------------------------------- the rest
 
 
-def _wire(load: _Load, system: System, table: Mapping[str, Any]) -> None:
-    _refuse_unknown(load, table, ("connect",), "key", "[wiring]")
+def _wire(load: Load, system: System, table: Mapping[str, Any]) -> None:
+    strange = load.refuse_unknown(table, ("connect",), "[wiring]")
+    load.unread |= bool(strange) and "connect" not in table
     entries = table.get("connect", [])
     if not isinstance(entries, list):
-        load.problems.append(ConfigurationError("[wiring] connect is not a list"))
+        load.refuse(
+            f"[wiring]: connect is {shown(entries)}, not a list\n"
+            '  write connect = ["orbit.r_e -> attitude.r_e", ...]'
+        )
+        load.unread = True
         return
     for entry in entries:
         match = _CONNECTION.match(entry) if isinstance(entry, str) else None
         if match is None:
             load.problems.append(
                 WiringError(
-                    f"{entry!r} is no connection\n"
+                    f"{shown(entry)} is no connection\n"
                     '  write "orbit.r_e -> attitude.r_e", with "(delay 0.1 s)" where there is one'
                 )
             )
+            named = _PORT.findall(entry) if isinstance(entry, str) else []
+            load.refused += [("", port) for port in named]
+            load.unread |= not named
             continue
         source, target, delay = match.groups()
-        if {source.split(".")[0], target.split(".")[0]} & load.broken:
-            load.attempted.add(target)
+        ends = (source, target)
+        if not load.is_lost(ends) and load.attempt(_connect, system, *ends, delay or 0):
             continue
-        before = len(load.problems)
-        load.attempt(system.connect, source, target, delay=delay or 0)
-        if len(load.problems) > before:
-            load.attempted.add(target)
+        load.refused.append(ends)
+        heads = {end.split(".")[0] for end in ends if "." in end}
+        load.unknown |= heads - set(system.nodes)
 
 
-def _overrides(
-    load: _Load, content: Mapping[str, Any], values: list[tuple[str, Any, str | None]]
-) -> dict[str, dict[str, Any]]:
-    """The record and dispersion tables with ``record.NAME.KEY`` settings applied."""
-    tables = {
-        kind: {
-            k: dict(v) if isinstance(v, dict) else v for k, v in _table(load, content, kind).items()
-        }
-        for kind in ("record", "dispersion")
-    }
-    for key, value, _ in values:
-        kind, _, rest = key.partition(".")
-        name, _, option = rest.partition(".")
-        if kind not in tables or name not in tables[kind] or not option:
-            known = [f"{k}.{n}.{o}" for k, t in tables.items() for n, v in t.items() for o in v]
-            load.problems.append(
-                ConfigurationError(f"cannot set '{key}'\n  {nearest(key, known, what='there are')}")
-            )
-            continue
-        if option in ("period", "rate"):
-            for other in ("period", "rate", "offset"):
-                tables[kind][name].pop(other, None)
-        tables[kind][name][option] = value
-    return tables
+def _connect(system: System, source: str, target: str, delay: Any) -> bool:
+    system.connect(source, target, delay=delay)
+    return True
 
 
-def _records(load: _Load, system: System, tables: Mapping[str, Any]) -> None:
+def _expose(system: System, name: str, target: object) -> None:
+    try:
+        system.expose(name, str(target))
+    except WiringError as error:
+        raise WiringError(f"cannot expose '{name}'\n  {error}") from error
+
+
+def _records(load: Load, system: System, tables: Mapping[str, dict[str, Any]]) -> None:
     for name, table in tables.items():
-        if not isinstance(table, dict):
-            load.problems.append(ConfigurationError(f"'record.{name}' is {table!r}; it is a table"))
-            continue
-        _refuse_unknown(load, table, ("ports", "doc", *TIMING), "key", f"record '{name}'")
-        rate = load.attempt(_rate, {k: table[k] for k in TIMING if k in table}, f"record '{name}'")
+        where = f"record '{name}'"
+        load.refuse_unknown(table, ("ports", "doc", *TIMING), where)
+        rate = load.attempt(_rate, {k: table[k] for k in TIMING if k in table}, where)
         ports = table.get("ports", [])
+        if isinstance(ports, str):
+            ports = [p for p in re.split(r"[\s,\[\]\"']+", ports) if p]
         if not isinstance(ports, list) or not all(isinstance(p, str) for p in ports):
-            load.problems.append(
-                ConfigurationError(f"record '{name}': ports is not a list of ports")
+            load.refuse(
+                f"{where}: ports is {shown(ports)}, not a list of ports\n"
+                '  write ports = ["orbit.r_e", ...]'
             )
-            continue
-        if {p.split(".")[0] for p in ports} & load.broken:
-            continue
-        load.attempt(system.record, name, ports, rate=rate)
+        elif not load.is_lost(ports):
+            load.attempt(system.record, name, ports, rate=rate)
 
 
-def _dispersions(load: _Load, system: System, tables: Mapping[str, Any]) -> None:
+def _dispersions(load: Load, system: System, tables: Mapping[str, dict[str, Any]]) -> None:
+    components = system.flatten().components
     for name, table in tables.items():
-        if not isinstance(table, dict):
-            load.problems.append(
-                ConfigurationError(f"'dispersion.{name}' is {table!r}; it is a table")
-            )
-            continue
-        kind = table.get("kind", "normal")
-        spread = KINDS.get(str(kind), "sigma")
-        _refuse_unknown(load, table, ("kind", "to", "doc", spread), "key", f"dispersion '{name}'")
-        if spread not in table:
-            load.problems.append(ConfigurationError(f"dispersion '{name}' needs a {spread}"))
-            continue
+        where = f"dispersion '{name}'"
+        kind = str(table.get("kind", "normal"))
+        spread = KINDS.get(kind, "sigma")
         targets = table.get("to", [])
         targets = [targets] if isinstance(targets, str) else targets
-        if {str(t).split(".")[0] for t in targets} & load.broken:
+        other = sorted(set(KINDS.values()) - {spread})[0]
+        if spread not in table and other in table:
+            load.refuse(f"{where} is {kind}: it takes {spread}, not {other}")
             continue
-        load.attempt(
-            system.disperse, Dispersion(name, tuple(targets), table[spread], kind=str(kind))
-        )
-
-
-# ---------------------------------------------------------------------- writing
-
-
-def write_system(system: System, path: str | Path) -> None:
-    """Write a system as TOML; `read_system` reads the same system back.
-
-    Raises
-    ------
-    ConfigurationError
-        If a component's type is not registered, or a nested system has no file.
-    """
-    Path(path).write_text(system_text(system), encoding="utf-8")
-
-
-def system_text(system: System) -> str:
-    """The TOML text of a system (nested systems flattened)."""
-    types = {e.value: name for name, e in component_entries().items()}
-    flat = system.flatten()
-    lines = [f'schema = "{SCHEMA}"', f'name = "{system.name}"']
-    if system.doc:
-        lines.append(f"doc = {_toml(system.doc)}")
-    if system.duration is not None:
-        lines.append(f'duration = "{text_seconds(system.duration)} s"')
-    lines += [f"members = {system.members}", f"seed = {system.seed}"]
-    names = {path: path.replace(".", "_") for path in flat.components}
-
-    def port(path: str) -> str:
-        owner, _, name = path.rpartition(".")
-        return f"{names[owner]}.{name}"
-
-    for path, component in flat.components.items():
-        value = f"{type(component).__module__}:{type(component).__qualname__}"
-        if value not in types:
-            raise ConfigurationError(
-                f"'{path}' is a {type(component).__name__}, which is no registered component type\n"
-                "  register it in the entry-point group terrafix.components"
+        load.refuse_unknown(table, ("kind", "to", "doc", spread), where)
+        if spread not in table:
+            load.refuse(f'{where} needs a {spread}\n  write it with its unit, {spread} = "1.0 m"')
+        elif not isinstance(targets, list) or not all(isinstance(t, str) for t in targets):
+            load.refuse(
+                f"{where}: to is {shown(targets)}, not a list of parameters\n"
+                '  write to = ["orbit.r0_i"]'
             )
-        lines += ["", f"[component.{names[path]}]", f'type = "{types[value]}"']
-        lines += _rate_lines(component.rate)
-        for name, setting in component.settings().items():
-            if name in component._base:
-                written = setting.write(component.setting(name))
-                lines.append(f"{name} = {_toml(written)}")
-    if flat.connections:
-        lines += ["", "[wiring]", "connect = ["]
-        for c in flat.connections:
-            delay = f" (delay {text_seconds(c.delay)} s)" if c.delay else ""
-            lines.append(f'    "{port(c.source)} -> {port(c.target)}{delay}",')
-        lines.append("]")
-    for record in flat.records:
-        lines += _record_lines(record, [port(p) for p in record.ports])
-    for d in flat.dispersions:
-        spread = KINDS[d.kind]
-        declared = d.parameter(flat.components)
-        value = declared.write(d.read_spread(flat.components))
-        lines += ["", f"[dispersion.{d.name.replace('.', '_')}]", f'kind = "{d.kind}"']
-        lines += [f"{spread} = {_toml(value)}", f"to = {_toml([port(t) for t in d.targets])}"]
-    return "\n".join(lines) + "\n"
-
-
-def _rate_lines(rate: Rate | None) -> list[str]:
-    if rate is None:
-        return []
-    if rate.times is not None:
-        return [f"times = {_toml([text_seconds(t) for t in rate.times])}"]
-    assert rate.period is not None
-    lines = [f'period = "{text_seconds(rate.period)} s"']
-    if rate.offset:
-        lines.append(f'offset = "{text_seconds(rate.offset)} s"')
-    return lines
-
-
-def _record_lines(record: Record, ports: list[str]) -> list[str]:
-    lines = ["", f"[record.{record.name}]", f"ports = {_toml(ports)}"]
-    return lines + _rate_lines(record.rate)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-        return f'"{escaped}"'
-    if isinstance(value, list):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
-    return repr(value)
+        elif not load.is_lost(targets):
+            dispersion = Dispersion(name, tuple(targets), table[spread], kind=kind)
+            load.attempt(system.disperse, dispersion)
+            bare = f"dispersion.{name}.{spread}" in load.bare
+            load.attempt(dispersion.read_spread, components, bare=bare)

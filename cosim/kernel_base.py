@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.noise import check_members
 
 FloatArray = NDArray[np.float64]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from terrafix.cosim.kernel_base import Argument, BoundArrays, BoundKernel, Kernel, Specification
 
 _DRAWN_AT_ONCE = 2048  # pairs of normals: 32 kB of scratch

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.kernel_base import BoundArrays, BoundKernel, Kernel
 from terrafix.cosim.noise import NormalBlocks, NormalStream
 

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.buffers import MessageSlot, Saved, SharedSlot, SignalSlot
 
 FloatArray = NDArray[np.float64]
@@ -30,7 +31,7 @@ class CopySignal:
     def __init__(self, source: SignalSlot, target: SignalSlot, factor: FloatArray | None) -> None:
         self.source, self.target, self.factor = source, target, factor
 
-    def __call__(self, tick: int) -> None:  # noqa: ARG002 - the moment does not matter
+    def __call__(self, tick: int) -> None:
         """Copy."""
         if self.factor is None:
             self.target.data[...] = self.source.data
@@ -44,7 +45,7 @@ class CopyMessage:
     def __init__(self, source: MessageSlot, target: MessageSlot, factor: FloatArray | None) -> None:
         self.source, self.target, self.factor = source, target, factor
 
-    def __call__(self, tick: int) -> None:  # noqa: ARG002 - the moment does not matter
+    def __call__(self, tick: int) -> None:
         """Copy."""
         if self.source.version != self.target.version:
             self.target.copy_from(self.source, self.factor)
@@ -56,7 +57,7 @@ class CopyShared:
     def __init__(self, source: SharedSlot, target: SharedSlot) -> None:
         self.source, self.target = source, target
 
-    def __call__(self, tick: int) -> None:  # noqa: ARG002 - the moment does not matter
+    def __call__(self, tick: int) -> None:
         """Hand on."""
         self.target.refer_to(self.source)
 

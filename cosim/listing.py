@@ -11,6 +11,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
+
 from terrafix.cosim.check import Plan
 from terrafix.cosim.clock import text_seconds
 from terrafix.cosim.component import Component

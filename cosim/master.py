@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.build import Wiring, bind_components, connect_ports
 from terrafix.cosim.check import Plan
 from terrafix.cosim.clock import Rate
@@ -31,7 +32,6 @@ class _Group:
         self.rate = rate
         self._base, self._grid = plan.base, plan.grid
         self._numerator, self._denominator = plan.base.numerator, plan.base.denominator
-        self.paths: list[str] = []
         self.sample: Callable[[float], None] | None = None
         self.move_to(0)
 
@@ -109,7 +109,7 @@ class Master:
         for path in plan.order:
             rate = plan.flat.components[path].rate
             assert rate is not None
-            self._group(rate).paths.append(path)
+            self._group_of[path] = self._groups.index(self._group(rate))
         self._entries = {
             path: _Entry(
                 path,
@@ -123,19 +123,15 @@ class Master:
         self._heap: list[tuple[int, int]] = []
 
     def _group(self, rate: Rate) -> _Group:
-        for number, group in enumerate(self._groups):
+        for group in self._groups:
             if group.rate == rate and group.sample is None:
-                break
-        else:
-            number, group = len(self._groups), _Group(rate, self.plan)
-            self._groups.append(group)
-        for path, component in self.plan.flat.components.items():
-            if component.rate == rate:
-                self._group_of[path] = number
+                return group
+        group = _Group(rate, self.plan)
+        self._groups.append(group)
         return group
 
     def observe(self, rate: Rate, sample: Callable[[float], None]) -> None:
-        """Call `sample(t)` at a rate, after everything due has stepped. Cannot influence the run."""
+        """Call `sample(t)` at a rate, after everything due has stepped; it influences nothing."""
         group = _Group(rate, self.plan)
         group.sample = sample
         self._groups.append(group)

@@ -17,6 +17,7 @@ from typing import Any, Generic, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.errors import ConfigurationError, nearest
 from terrafix.cosim.ports import Declaration, Unit
 from terrafix.cosim.units import conversion_factor, split_quantity
@@ -168,7 +169,8 @@ class Parameter(Setting[FloatArray]):
         self, array: FloatArray, unit: str | None, *, where: str, bare: bool
     ) -> FloatArray:
         if unit is None:
-            if not bare and self.unit not in ("1", "") and not np.all(array == 0.0):
+            has_unit = isinstance(self.unit, str) and self.unit not in ("1", "")
+            if not bare and has_unit and not np.all(array == 0.0):
                 raise ConfigurationError(f"{where} has no unit\n  {self._wanted()}")
             return array
         if not isinstance(self.unit, str):
@@ -233,7 +235,7 @@ class Count(Setting[int]):
         super().__init__(default, doc=doc)
         self.minimum, self.maximum = minimum, maximum
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> int:  # noqa: ARG002 - no unit
+    def read(self, value: Any, *, where: str, bare: bool = True) -> int:
         """Accept an integer, or text of one."""
         if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d+\s*", value):
             value = int(value)
@@ -250,7 +252,7 @@ class Count(Setting[int]):
 class Flag(Setting[bool]):
     """True or false."""
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> bool:  # noqa: ARG002 - no unit
+    def read(self, value: Any, *, where: str, bare: bool = True) -> bool:
         """Accept a boolean, or the text ``true`` or ``false``."""
         if isinstance(value, str) and value.strip().lower() in ("true", "false"):
             return value.strip().lower() == "true"
@@ -270,7 +272,7 @@ class Choice(Setting[str]):
         """Describe what is accepted, for listings."""
         return " | ".join(f'"{o}"' for o in self.options)
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> str:  # noqa: ARG002 - no unit
+    def read(self, value: Any, *, where: str, bare: bool = True) -> str:
         """Accept one of the options."""
         if not isinstance(value, str) or value not in self.options:
             hint = nearest(str(value), self.options)
@@ -283,7 +285,7 @@ class Choice(Setting[str]):
 class Text(Setting[str]):
     """Free text."""
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> str:  # noqa: ARG002 - no unit
+    def read(self, value: Any, *, where: str, bare: bool = True) -> str:
         """Accept text."""
         if not isinstance(value, str):
             raise ConfigurationError(f"{where} is {shown(value)}; it takes text")
@@ -296,7 +298,7 @@ _VARIABLE = re.compile(r"\$\{(\w+)(?::-([^}]*))?\}|\$(\w+)")
 class FilePath(Setting[Path]):
     """A file: relative to the system file, with ``${NAME:-fallback}`` from the environment."""
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> Path:  # noqa: ARG002 - no unit
+    def read(self, value: Any, *, where: str, bare: bool = True) -> Path:
         """Accept a path; environment variables and ``~`` are expanded."""
         if isinstance(value, Path):
             return value

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.display import shown_unit
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.evaluation import member_mean, root_mean_square, sample_sigma

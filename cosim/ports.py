@@ -20,11 +20,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
-from typing import Any, Generic, Literal, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
 from terrafix.cosim.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from terrafix.cosim.buffers import (  # noqa: F401 - in quotes below: what a port shows
+        BundleView,
+        MessageReader,
+        MessageWriter,
+        WindowView,
+    )
 
 FloatArray = NDArray[np.float64]
 Unit = str | tuple[str, ...]

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.buffers import MessageSlot, SignalSlot
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.ports import Field, Port
@@ -138,7 +139,7 @@ class Recorder:
             self._chunk[index][i, mask] = np.nan
 
     def flush(self) -> None:
-        """Move the samples taken so far out of the working chunk, to a file if there is a folder."""
+        """Move the samples taken so far out of the working chunk: to a file, if in a folder."""
         self._last_flush = time.monotonic()
         if not self._used:
             return
@@ -150,7 +151,7 @@ class Recorder:
             return
         target = self.folder / f"{self.name}.{self._n_files:06d}.npz"
         self._n_files += 1
-        arrays = {f"v{i}": v for i, v in enumerate(values)}
+        arrays: dict[str, Any] = {f"v{i}": v for i, v in enumerate(values)}
         write_atomically(target, lambda f: np.savez(f, t=times, **arrays))
 
     def history(self) -> tuple[NDArray[np.float64], Arrays]:
@@ -182,6 +183,8 @@ class Recorder:
         files = chunk_files(self.folder, self.name)
         kept = 0
         for number, file in enumerate(files):
+            if file.name != f"{self.name}.{number:06d}.npz":
+                break  # one is missing
             (times, values) = _read_chunk(file)
             use = min(len(times), n - kept)
             if use <= 0:
@@ -223,7 +226,7 @@ def chunk_files(folder: Path, name: str) -> list[Path]:
 
 def _read_chunk(file: Path) -> tuple[NDArray[np.float64], list[NDArray[Any]]]:
     try:
-        with np.load(file, allow_pickle=False) as stored:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
             return stored["t"], [stored[f"v{i}"] for i in range(len(stored.files) - 1)]
     except Exception as error:  # a damaged file may fail in any way
         raise ConfigurationError(f"records in '{file}' are damaged: {error}") from error

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.ports import Field
 from terrafix.cosim.record import MANIFEST, Recorder, Variable, _join, _read_chunks
@@ -108,7 +109,7 @@ def build_dataset(
     for path, (unit, values) in (parameters or {}).items():
         dims = ["member", *labels.names(Field(), values.shape[1:])]
         variables[f"parameter:{path}"] = (dims, values, {"units": unit})
-    coordinates |= {k: v for k, v in labels.coordinates.items()}
+    coordinates |= labels.coordinates
     plain = {
         k: v if isinstance(v, str | int | float) else json.dumps(v, default=_plain)
         for k, v in attributes.items()
@@ -160,7 +161,7 @@ def read_result(path: str | Path) -> xarray.Dataset:
     try:
         dataset = xarray.load_dataset(path, engine="netcdf4")
     except (OSError, ValueError, RuntimeError) as error:
-        raise ConfigurationError(f"'{path}' is damaged or no NetCDF file: {error}") from error
+        raise ConfigurationError(f"'{path}' is damaged or no NetCDF file") from error
     schema = dataset.attrs.get("schema")
     if schema != SCHEMA:
         raise ConfigurationError(

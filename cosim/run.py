@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.buffers import SignalSlot
 from terrafix.cosim.check import Plan, check, record_rate
 from terrafix.cosim.checkpoint import read_checkpoint, write_checkpoint
@@ -392,7 +393,7 @@ def simulate(
     saved = None if resume is None else read_checkpoint(Path(resume))
     every = None if checkpoint_every is None else seconds(checkpoint_every, "checkpoint interval")
     if every is not None and every <= 0:
-        raise RateError(f"checkpoint interval is {checkpoint_every} s; it must be positive")
+        raise RateError(f"checkpoint interval is {text_seconds(every)} s; it must be positive")
     target = _checkpoint_path(system, checkpoint or resume, out)
     folder = _folder(out, target if every is not None or saved is not None else None)
     simulation = Simulation(system, members=members, seed=seed, folder=folder, progress=progress)
@@ -431,7 +432,7 @@ def _refuse_impossible(
     if master.ticks(length) == 0:
         raise RateError(
             f"duration is {text_seconds(length)} s, shorter than the base step of "
-            f"{text_seconds(base)} s"
+            f"{text_seconds(base)} s\n  give a longer one"
         )
     if saved is not None and saved["master"]["tick"] > master.ticks(length):
         raise CheckpointError(
@@ -518,9 +519,9 @@ def _member_numbers(members: int | Sequence[int]) -> NDArray[np.int64]:
 def _duration(system: System, duration: Exact | None) -> Fraction:
     length = system.duration if duration is None else seconds(duration, "duration")
     if length is None:
-        raise RateError(f"system '{system.name}' has no duration; give one")
+        raise RateError(f"system '{system.name}' has no duration; give one, such as '600 s'")
     if length <= 0:
-        raise RateError(f"duration is {duration} s; it must be positive")
+        raise RateError(f"duration is {text_seconds(length)} s; it must be positive")
     return length
 
 

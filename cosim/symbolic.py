@@ -4,6 +4,10 @@ The model satisfies a small protocol (`SymbolicModel`); nothing here knows which
 holds. Names in the model are bound to ports by name: ``"delta_v"`` to a signal, ``"fix.y"`` to a
 field of a bundle or message, ``"fix.fresh"`` and ``"fix.t"`` to a message's freshness and time of
 validity, and the output ``"fix.valid"`` says which members a message reaches.
+
+A message never received is NaN, and a member whose results are not all finite fails: guard what
+comes from a message with ``if_else(fresh, ..., 0)``, also in the fields of an answer that is not
+sent.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.buffers import BundleView, MessageReader, MessageWriter
 from terrafix.cosim.component import Component, Environment
 from terrafix.cosim.errors import ConfigurationError, nearest
@@ -28,7 +33,9 @@ Symbols = Mapping[str, Any]
 class SymbolicModel(Protocol):
     """What is needed of a model: names, shapes, and two functions of flat row-major arguments."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Identifier; names the generated functions."""
 
     @property
     def inputs(self) -> Symbols:
@@ -117,6 +124,13 @@ class SymbolicComponent(Component):
             raise ConfigurationError(
                 f"model '{self.model.name}' has an {side} '{name}', but {type(self).__name__} has "
                 f"no such port\n  {nearest(head, ports, what='its ports')}"
+            )
+        ragged = side == "output" and any(field.ragged for field in port.fields.values())
+        if port.window or port.kind == "shared" or ragged:
+            kind = "window" if port.window else "shared" if port.kind == "shared" else "ragged"
+            raise ConfigurationError(
+                f"model '{self.model.name}' has an {side} '{name}', but port '{head}' is {kind}\n"
+                "  a symbolic model takes signals and messages of fixed shape"
             )
         known = set(port.fields) | (extra if port.kind == "message" else set())
         if tail not in known:

@@ -262,7 +262,7 @@ class System:
         ]
 
     def _systems(self) -> Iterator[System]:
-        """This system and all systems within."""
+        """Yield this system and all systems within."""
         yield self
         for node in self.nodes.values():
             if isinstance(node, System):
@@ -336,8 +336,8 @@ class System:
         return read_system(path, settings)
 
     def to_file(self, path: str | Path) -> None:
-        """Write the system as TOML (`terrafix.cosim.files.write_system`)."""
-        from terrafix.cosim.files import write_system
+        """Write the system as TOML (`terrafix.cosim.writing.write_system`)."""
+        from terrafix.cosim.writing import write_system
 
         write_system(self, path)
 

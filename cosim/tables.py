@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
+
 from terrafix.cosim.display import is_consistency, is_quantity, number, shown_unit, summaries
 
 if TYPE_CHECKING:

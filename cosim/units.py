@@ -19,7 +19,7 @@ DIMENSIONLESS = ("", "1")
 def _registry() -> Any:
     import pint
 
-    registry = pint.UnitRegistry()
+    registry: Any = pint.UnitRegistry()
     registry.define("px = pixel")  # of an image; Pint's own px is a length, 1/96 inch
     return registry
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from terrafix.cosim.errors import ConfigurationError, WiringError
 from terrafix.cosim.ports import Field, Port
 from terrafix.cosim.units import conversion_factor
@@ -65,7 +66,7 @@ def _field_problem(name: str, source: Field, target: Field) -> str | None:
 
 
 def field_factor(source: Field, target: Field) -> FloatArray | None:
-    """Factors from one field's unit(s) to another's, scalar or by last axis; None if they differ."""
+    """Factors from one field's unit(s) to another's, scalar or by last axis; None if none fits."""
     if source.unit == target.unit:
         return np.float64(1.0)  # type: ignore[return-value]
     n = source.shape[-1] if source.shape else 1

@@ -289,11 +289,25 @@ def toys():
         **{
             c.__name__: c
             for c in (
-                Clock, EndSpy, StartSpy, WindowSpy, Sender, Reader, StartReader, QueueReader,
-                StartQueueReader, FirstReader, Walk, Filter, Failing, Source, Viewer, StartViewer,
+                Clock,
+                EndSpy,
+                StartSpy,
+                WindowSpy,
+                Sender,
+                Reader,
+                StartReader,
+                QueueReader,
+                StartQueueReader,
+                FirstReader,
+                Walk,
+                Filter,
+                Failing,
+                Source,
+                Viewer,
+                StartViewer,
             )
         },
         wire=wire,
         fly=fly,
         payload=payload,
-    )  # fmt: skip
+    )

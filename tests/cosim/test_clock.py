@@ -90,11 +90,19 @@ def test_activations_of_a_period_with_an_offset():
     assert list(islice(Rate("0.3").ticks(base), 3)) == [3, 6, 9]
     assert list(islice(Rate("0.3", offset="0.2").ticks(base), 3)) == [2, 5, 8]
     assert list(islice(Rate("0.3", offset="0.2").ticks(base, after=5), 2)) == [8, 11]
-    assert [Rate("0.3", offset="0.2").last_tick(base, None, k) for k in (1, 2, 4, 5)] == [0, 2, 2, 5]
+    assert [Rate("0.3", offset="0.2").last_tick(base, None, k) for k in (1, 2, 4, 5)] == [
+        0,
+        2,
+        2,
+        5,
+    ]
 
 
 @given(
-    st.integers(1, 50), st.integers(0, 100), st.integers(0, 300), st.sets(st.integers(0, 200), min_size=1)
+    st.integers(1, 50),
+    st.integers(0, 100),
+    st.integers(0, 300),
+    st.sets(st.integers(0, 200), min_size=1),
 )
 def test_continuing_from_any_tick_gives_the_rest_of_the_activations(period, offset, after, listed):
     base = Fraction(1, 7)
@@ -127,8 +135,9 @@ def test_listed_times_closer_than_the_base_step_are_refused(toys):
 
 def test_time_is_one_division_and_never_a_sum(toys):
     """At 30 Hz, tick k is the float nearest k/30, also after many steps."""
-    system = toys.wire({"a": toys.Clock(rate=Rate(hz=30)), "b": toys.EndSpy(rate=Rate(hz=30))},
-                       ["a.t -> b.u"])  # fmt: skip
+    system = toys.wire(
+        {"a": toys.Clock(rate=Rate(hz=30)), "b": toys.EndSpy(rate=Rate(hz=30))}, ["a.t -> b.u"]
+    )
     toys.fly(system, 40)
     times = [t for t, _, _ in system.nodes["b"].seen]
     assert times == [float(Fraction(k, 30)) for k in range(1, 1201)]
@@ -156,9 +165,13 @@ def test_a_recorder_does_not_move_what_is_snapped(toys):
 
     def run(*records):
         system = toys.wire(
-            {"line": toys.Clock(rate=Rate(times=["0.5003", "1.2"])), "beat": toys.Clock(rate=Rate("0.5"))},
-            [], ["line.t"],
-        )  # fmt: skip
+            {
+                "line": toys.Clock(rate=Rate(times=["0.5003", "1.2"])),
+                "beat": toys.Clock(rate=Rate("0.5")),
+            },
+            [],
+            ["line.t"],
+        )
         for period in records:
             system.record("fine", ["beat.t"], period=period)
         simulation = toys.fly(system, 3)

@@ -48,7 +48,9 @@ def test_a_draw_depends_on_seed_member_and_name_alone(toys):
 @pytest.mark.parametrize("kind", ["normal", "uniform"])
 def test_the_spread_is_the_standard_deviation_or_the_half_width(toys, kind):
     n = 20_000
-    draws = starts(pair(toys, Dispersion("d", ("ekf.start",), [100.0, 1.0], kind)), members=n)["ekf"]
+    draws = starts(pair(toys, Dispersion("d", ("ekf.start",), [100.0, 1.0], kind)), members=n)[
+        "ekf"
+    ]
     draws = (draws - [10, 20]) / [100, 1]
     sigma = 1 if kind == "normal" else 1 / np.sqrt(3)
     np.testing.assert_allclose(draws.mean(axis=0), 0, atol=4 * sigma / np.sqrt(n))
@@ -104,7 +106,7 @@ def test_a_draw_out_of_range_is_refused_and_nothing_stays_bound(toys):
 
     system = toys.wire({"w": Positive()}, [], duration=1)
     system.disperse(Dispersion("d", ("w.start",), 100.0))
-    with pytest.raises(ConfigurationError, match="'w.start' after dispersion 'd'"):
+    with pytest.raises(ConfigurationError, match=r"'w\.start' after dispersion 'd'"):
         simulate(system, members=10)
     system.nodes["w"].start = 2.0
 

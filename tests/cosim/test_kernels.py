@@ -11,6 +11,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+
 from terrafix.cosim import toolchain
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.kernel_compiled import kernel_source

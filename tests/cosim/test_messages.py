@@ -1,13 +1,16 @@
 """Messages: fresh once per consumer, valid per member, queued, never mistaken for data."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component
-from terrafix.cosim.errors import ConfigurationError, StepError
-from terrafix.cosim.ports import Field, MessageInput, MessageOutput, Output
+from terrafix.cosim.errors import ConfigurationError, StepError, SystemCheckError
+from terrafix.cosim.ports import Field, MessageInput, MessageOutput, Output, WindowInput
 from terrafix.cosim.run import simulate
+from terrafix.cosim.symbolic import SymbolicComponent
+from terrafix.models.model import Model
 
 LINK = ["send.note -> read.note"]
 
@@ -24,15 +27,19 @@ def test_a_message_is_fresh_once(toys):
 
 def test_a_message_is_fresh_for_each_consumer_at_its_own_rate(toys):
     fast, slow = toys.Reader(), toys.Reader(rate=Rate("4"))
-    system = toys.wire({"send": toys.Sender(every(3)), "read": fast, "slow": slow},
-                       [*LINK, "send.note -> slow.note"])  # fmt: skip
+    system = toys.wire(
+        {"send": toys.Sender(every(3)), "read": fast, "slow": slow},
+        [*LINK, "send.note -> slow.note"],
+    )
     toys.fly(system, 12)
     assert [(t, validity) for t, _, validity, _ in fast.found] == [(3, 3), (6, 6), (9, 9), (12, 12)]
     assert [(t, validity) for t, _, validity, _ in slow.found] == [(4, 3), (8, 6), (12, 12)]
 
 
 def test_messages_that_were_replaced_before_they_were_read_are_counted(toys):
-    system = toys.wire({"send": toys.Sender(), "read": toys.Reader(rate=Rate("4"))}, LINK, duration=9)
+    system = toys.wire(
+        {"send": toys.Sender(), "read": toys.Reader(rate=Rate("4"))}, LINK, duration=9
+    )
     result = simulate(system, members=2)
     assert result.overruns == {"read.note": 2 * 2 * 3}
 
@@ -41,7 +48,14 @@ def test_a_message_reaches_the_members_it_is_valid_for(toys):
     plan = lambda step, members: members % 2 == step % 2  # noqa: E731 - reads as data
     reader = toys.Reader()
     toys.fly(toys.wire({"send": toys.Sender(plan), "read": reader}, LINK), 4, members=[0, 1, 5])
-    assert [(t, m) for t, m, _, _ in reader.found] == [(1, 1), (1, 2), (2, 0), (3, 1), (3, 2), (4, 0)]
+    assert [(t, m) for t, m, _, _ in reader.found] == [
+        (1, 1),
+        (1, 2),
+        (2, 0),
+        (3, 1),
+        (3, 2),
+        (4, 0),
+    ]
     assert all(v == [t, (0, 1, 5)[m]] for t, m, _, v in reader.found)
 
 
@@ -58,10 +72,15 @@ def test_a_message_never_written_cannot_be_taken_for_a_measurement(toys):
 
 def test_messages_of_t_zero(toys):
     """Read at initialization by who does something then, else at the first step; never lost."""
-    first, later, offset = toys.FirstReader(), toys.Reader(), toys.FirstReader(rate=Rate(2, offset=2))
+    first, later, offset = (
+        toys.FirstReader(),
+        toys.Reader(),
+        toys.FirstReader(rate=Rate(2, offset=2)),
+    )
     parts = {"send": toys.Sender(every(50), at_start=True), "first": first, "later": later}
-    system = toys.wire(parts | {"offset": offset},
-                       [f"send.note -> {k}.note" for k in ("first", "later", "offset")])  # fmt: skip
+    system = toys.wire(
+        parts | {"offset": offset}, [f"send.note -> {k}.note" for k in ("first", "later", "offset")]
+    )
     toys.fly(system, 6)
     assert [t for t, *_ in first.found] == [0]
     assert [(t, v) for t, _, v, _ in later.found] == [(1, 0)]
@@ -79,7 +98,9 @@ def test_messages_read_at_the_start_come_one_step_later(toys):
 
 def test_delayed_messages_keep_their_time_of_validity(toys):
     reader = toys.Reader(rate=Rate("0.5"))
-    toys.fly(toys.wire({"send": toys.Sender(every(3)), "read": reader}, [LINK[0] + " delay 1.5"]), 8)
+    toys.fly(
+        toys.wire({"send": toys.Sender(every(3)), "read": reader}, [LINK[0] + " delay 1.5"]), 8
+    )
     assert [(t, v) for t, _, v, _ in reader.found] == [(4.5, 3), (7.5, 6)]
 
 
@@ -154,7 +175,9 @@ class Tracer(Component):
 
 def test_ragged_messages_carry_their_count_per_member(toys):
     trace = Tracer()
-    system = toys.wire({"c": Contour(), "t": trace}, ["c.outline -> t.outline"], ["c.outline"], duration=2)
+    system = toys.wire(
+        {"c": Contour(), "t": trace}, ["c.outline -> t.outline"], ["c.outline"], duration=2
+    )
     result = simulate(system, members=3)
     assert [len(s) for s in trace.seen] == [2, 3, 0]
     assert all((s == 2.0).all() for s in trace.seen)
@@ -193,7 +216,9 @@ def test_messages_with_fields(toys):
     reader = MatchReader()
     toys.fly(toys.wire({"m": Matcher(), "r": reader}, ["m.match -> r.match"]), 1)
     assert reader.seen == ([[1, 1]], [0.9], [0.5])
-    with pytest.raises(AttributeError, match=r"no field 'peek'; the fields are \['offset', 'peak'\]"):
+    with pytest.raises(
+        AttributeError, match=r"no field 'peek'; the fields are \['offset', 'peak'\]"
+    ):
         _ = reader.match.peek
 
 
@@ -215,3 +240,73 @@ def test_an_excluded_member_gets_no_more_messages(toys):
     reader = toys.Reader()
     toys.fly(toys.wire({"send": Quitter(), "read": reader}, LINK), 3, members=2)
     assert [(t, m) for t, m, *_ in reader.found] == [(1, 0), (1, 1), (2, 0), (3, 0)]
+
+
+# ---------------------------------------------------------------------- symbolic models
+
+
+def gated_model():
+    y, fresh, x, when = (
+        ca.SX.sym(s, *n) for s, n in (("y", (2,)), ("f", ()), ("x", (2,)), ("t", ()))
+    )
+    got = fresh > 0.5
+    new = ca.if_else(got, x + y, x)
+    return Model(
+        "gated",
+        inputs={"note": y, "note.fresh": fresh, "note.t": when},
+        states={"x": x},
+        next={"x": new},
+        outputs={
+            "total": x,
+            "answer.y": 2 * x,
+            "answer.valid": got,
+            "answer.age": ca.if_else(got, when, 0),
+        },
+    )
+
+
+class Gated(SymbolicComponent):
+    """Adds up messages and answers each."""
+
+    default_rate = Rate("1")
+    note = MessageInput((2,), unit="m")
+    total = Output((2,), unit="m")
+    answer = MessageOutput(fields={"y": Field((2,), "m"), "age": Field((), "s")})
+
+    def build_model(self):
+        return gated_model()
+
+
+class GatedLate(Gated):
+    note = MessageInput((2,), unit="m", at="start")
+
+
+@pytest.mark.parametrize("kind", [Gated, GatedLate])
+def test_a_symbolic_model_does_not_take_a_message_never_written_for_data(toys, kind):
+    """Its numbers are NaN until then, and touch nothing; the answers go to who asked."""
+    plan = lambda step, members: (members == 1) & (step % 2 == 0)  # noqa: E731 - reads as data
+    system = toys.wire(
+        {"send": toys.Sender(plan), "g": kind()},
+        ["send.note -> g.note"],
+        ["g.total", "g.answer"],
+        duration=6,
+    )
+    result = simulate(system, members=2)
+    assert result.excluded == []
+    late = kind is GatedLate
+    total = {False: [0, 0, 2, 2, 6, 6, 12], True: [0, 0, 0, 2, 2, 6, 6]}[late]
+    assert result.dataset["g.total"].values[:, 1, 0].tolist() == total
+    assert (result.dataset["g.total"].values[:, 0] == 0).all()
+    answers = result.dataset["g.answer.t"].values
+    assert np.isnan(answers[:, 0]).all()
+    expected = [t + late for t in (2, 4, 6) if t + late <= 6]
+    assert answers[np.isfinite(answers[:, 1]), 1].tolist() == expected
+
+
+def test_symbolic_models_refuse_what_has_no_fixed_shape(toys):
+    class Windowed(Gated):
+        note = WindowInput((2,), unit="m")
+
+    system = toys.wire({"g": Windowed(), "w": toys.Walk()}, ["w.x -> g.note"], duration=1)
+    with pytest.raises(SystemCheckError, match="has an input 'note', but port 'note' is window"):
+        simulate(system)

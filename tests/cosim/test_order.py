@@ -18,7 +18,9 @@ def seen(system, name):
 def test_sources_step_before_those_who_read_them_at_the_end(toys):
     """a -> m -> z and z -> b, against the alphabet: every link within one tick."""
     parts = {"z": toys.Clock, "m": toys.EndSpy, "b": toys.EndSpy, "a": toys.EndSpy}
-    system = toys.wire({k: c() for k, c in parts.items()}, ["z.t -> m.u", "m.echo -> b.u", "b.echo -> a.u"])
+    system = toys.wire(
+        {k: c() for k, c in parts.items()}, ["z.t -> m.u", "m.echo -> b.u", "b.echo -> a.u"]
+    )
     assert check(system).order == ["z", "m", "b", "a"]
     toys.fly(system, 3)
     assert seen(system, "a") == [(1, 1), (2, 2), (3, 3)]
@@ -72,8 +74,9 @@ class Both(Component):
 
 def test_latched_start_read_where_the_source_must_step_first(toys):
     """Both reads are of one source: it has to step first, so the start-read is latched."""
-    system = toys.wire({"clock": toys.Clock(), "both": Both()},
-                       ["clock.t -> both.now", "clock.t -> both.before"])  # fmt: skip
+    system = toys.wire(
+        {"clock": toys.Clock(), "both": Both()}, ["clock.t -> both.now", "clock.t -> both.before"]
+    )
     simulation = toys.fly(system, 3)
     assert "copy:both.before" in simulation.master.wiring.keepers
     assert system.nodes["both"].seen == [(1, 1, 0), (2, 2, 1), (3, 3, 2)]
@@ -81,8 +84,10 @@ def test_latched_start_read_where_the_source_must_step_first(toys):
 
 def test_two_components_may_read_each_other_at_the_start(toys):
     """Jacobi both ways; each sees the other's value of one step earlier."""
-    system = toys.wire({"a": toys.StartSpy(), "clock": toys.Clock(), "b": Both()},
-                       ["b.y -> a.u", "a.echo -> b.before", "clock.t -> b.now"])  # fmt: skip
+    system = toys.wire(
+        {"a": toys.StartSpy(), "clock": toys.Clock(), "b": Both()},
+        ["b.y -> a.u", "a.echo -> b.before", "clock.t -> b.now"],
+    )
     toys.fly(system, 5)
     assert seen(system, "a") == [(1, 0), (2, 1), (3, 2), (4, 3), (5, 4)]
     assert [before for _, _, before in system.nodes["b"].seen] == [0, 0, 1, 2, 3]
@@ -117,7 +122,9 @@ def test_start_reads_of_any_source_see_the_beginning_of_the_step(toys, source, r
         assert value[0] == held(t, dt, *source), (t, dt)
 
 
-@pytest.mark.parametrize(("times", "expected"), [(["2", "4"], [0, 2, 4, 4]), (["1", "3"], [0, 1, 3, 3])])
+@pytest.mark.parametrize(
+    ("times", "expected"), [(["2", "4"], [0, 2, 4, 4]), (["1", "3"], [0, 1, 3, 3])]
+)
 def test_start_reads_of_listed_times(toys, times, expected):
     """On the reader's steps (read in place) and between them (latched)."""
     spy = toys.StartSpy(rate=Rate(2))
@@ -128,16 +135,21 @@ def test_start_reads_of_listed_times(toys, times, expected):
 
 def test_start_read_of_ones_own_output(toys):
     spy = toys.StartSpy()
-    system = toys.wire({"clock": toys.Clock(), "own": Both(), "spy": spy},
-                       ["own.y -> own.before", "clock.t -> own.now", "own.y -> spy.u"])  # fmt: skip
+    system = toys.wire(
+        {"clock": toys.Clock(), "own": Both(), "spy": spy},
+        ["own.y -> own.before", "clock.t -> own.now", "own.y -> spy.u"],
+    )
     toys.fly(system, 3)
     assert system.nodes["own"].seen == [(1, 1, 0), (2, 2, 1), (3, 3, 2)]
 
 
 def test_inputs_that_have_nothing_to_hold_at_initialization_are_nan_whatever_the_names(toys):
-    """Delayed and start-read inputs: never the t = 0 value of a source that happened to be first."""
+    """Delayed and start-read inputs: never the t = 0 value of a source that came first."""
     for name in ("a", "z"):
-        for connection, spy in (("m.t -> {}.u delay 2", toys.EndSpy), ("m.t -> {}.u", toys.StartSpy)):
+        for connection, spy in (
+            ("m.t -> {}.u delay 2", toys.EndSpy),
+            ("m.t -> {}.u", toys.StartSpy),
+        ):
 
             class AtStart(spy):
                 def _initialize_impl(self):
@@ -153,8 +165,10 @@ def test_a_shared_value_read_at_the_start_is_the_one_of_a_step_ago(toys):
     """By reference and whatever the names; an end-read sees the array of its own instant."""
     for early, late in (("a", "b"), ("y", "z")):
         source, now, before = toys.Source(), toys.Viewer(), toys.StartViewer()
-        system = toys.wire({"m": source, early: now, late: before},
-                           [f"m.image -> {early}.image", f"m.image -> {late}.image"])  # fmt: skip
+        system = toys.wire(
+            {"m": source, early: now, late: before},
+            [f"m.image -> {early}.image", f"m.image -> {late}.image"],
+        )
         toys.fly(system, 3)
         assert [float(v[0, 0].real) for _, v in now.seen] == [1, 2, 3]
         assert [float(v[0, 0].real) for _, v in before.seen] == [0, 1, 2]
@@ -171,9 +185,10 @@ LOOP = """algebraic loop
 
 
 def test_a_loop_of_end_reads_is_printed_link_by_link(toys):
-    system = toys.wire({"navigator": toys.EndSpy(), "matcher": toys.EndSpy(), "o": toys.EndSpy()},
-                       ["navigator.echo -> matcher.u", "matcher.echo -> navigator.u",
-                        "matcher.echo -> o.u"])  # fmt: skip
+    system = toys.wire(
+        {"navigator": toys.EndSpy(), "matcher": toys.EndSpy(), "o": toys.EndSpy()},
+        ["navigator.echo -> matcher.u", "matcher.echo -> navigator.u", "matcher.echo -> o.u"],
+    )
     with pytest.raises(SystemCheckError) as caught:
         check(system)
     text = str(caught.value.problems[0])

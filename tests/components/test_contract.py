@@ -1,0 +1,240 @@
+"""What every component type keeps: one test for all that are registered, new ones included.
+
+Each is flown alone, on inputs that differ between members: a member of an ensemble equals the same
+member alone, a state taken and set back continues to the same bytes, every port and parameter says
+what it is.
+"""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+
+from terrafix.cosim.checkpoint import read_checkpoint, write_checkpoint
+from terrafix.cosim.clock import Rate
+from terrafix.cosim.component import Component
+from terrafix.cosim.errors import ConfigurationError
+from terrafix.cosim.parameters import Parameter
+from terrafix.cosim.ports import BundleOutput, MessageOutput, Output
+from terrafix.cosim.registry import component_entries, component_type
+from terrafix.cosim.run import Simulation, simulate
+from terrafix.cosim.system import System
+from terrafix.models.attitude import lvlh_quaternion_array
+
+TYPES = sorted(n for n, e in component_entries().items() if e.value.startswith("terrafix."))
+SIZES = (1, 7, 100)
+STEP, HALF, WHOLE = "0.1", "0.8", "1.6"  # [s]
+
+R_E = np.array([-1104646.3, -6096830.4, 3395727.4])  # [m], an orbit of 700 km
+V_E = np.array([-1004.7, 3648.9, 6498.0])  # [m/s]
+Q_BE = lvlh_quaternion_array(R_E, V_E)
+SIGMA = np.array([100.0] * 3 + [1.0] * 3 + [1e-4] * 3)  # [m], [m/s], [rad]
+
+# Values of inputs and parameters: (mean, sigma over members and steps), by name of port or field.
+INPUTS = {
+    "r_e": (R_E, 100.0),
+    "v_e": (V_E, 0.1),
+    "q_be": (Q_BE, 0.0),
+    "q_be_true": (Q_BE, 0.0),
+    "q_mu": (np.array([0.0, 0.0, 0.0, 1.0]), 0.0),
+    "delta_v_e": (np.zeros(3), 1e-3),
+    "delta_v_b": (np.zeros(3), 1e-3),
+    "delta_v_b_true": (np.zeros(3), 1e-3),
+    "delta_theta_b": (np.zeros(3), 1e-4),
+    "delta_theta_b_true": (np.zeros(3), 1e-4),
+    "P": (np.diag(SIGMA**2), 0.0),
+    "y": (np.array([0.0, 0.0, 9.0e5, 7.5e3]), np.array([1e-3, 1e-3, 100.0, 1.0])),
+    "r_f_e": (R_E * 0.9, 100.0),
+    "R": (np.diag([0.0, 0.0, 1.0, 0.3]), 0.0),
+    "D": (25.0 * np.eye(3), 0.0),
+    "present": (np.ones(4), 0.0),
+    "residual": (np.zeros(4), 1.0),
+    "sigma": (np.ones(4), 0.0),
+    "nis": (4.0, 0.1),
+    "dof": (4.0, 0.0),
+    "accepted": (1.0, 0.0),
+    "reason": (0.0, 0.0),
+}
+SETTINGS = {
+    "antenna_mount": {"misalignment_sigma0": 1e-3, "misalignment_walk": 1e-4},
+    "attitude_sensor": {"noise_sigma": 1e-4, "bias_sigma": 1e-3},
+    "imu": {
+        "velocity_random_walk": 1e-5,
+        "accel_bias_sigma0": 1e-4,
+        "accel_bias_walk": 1e-6,
+        "angle_random_walk": 1e-6,
+        "gyro_bias_sigma0": 1e-6,
+        "gyro_bias_walk": 1e-8,
+    },
+    "mekf_correct": {"look": 0.6},
+    "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
+    "orbit": {"r0_i": R_E, "v0_i": [-560.1, 3729.6, 6497.9]},
+    "synthetic_sar_fix": {"look": 0.6},
+}
+RATES = {"last_known_state": Rate(times=["0"])}
+
+
+class Inputs(Component):
+    """Base of what drives a component under test: an output for each of its inputs."""
+
+    default_rate = Rate(STEP)
+
+    def _initialize_impl(self):
+        self._publish(0.0)
+
+    def _step_impl(self, t, dt):
+        self._publish(t)
+
+    def _publish(self, t):
+        for name, port in self.ports.items():
+            values = {f: self._draw(f or name, f"{name}.{f}", port.fields[f]) for f in port.fields}
+            if port.kind == "message":
+                self._views[name].publish(t, **values)
+            elif port.is_bundle:
+                for f, value in values.items():
+                    self._views[name].__dict__[f][...] = value
+            else:
+                setattr(self, name, values[""])
+
+    def _draw(self, name, stream, field):
+        mean, sigma = INPUTS[name]
+        mean = np.asarray(mean)[tuple(slice(n) for n in field.shape)]  # of P, what is needed
+        noise = self.normals(stream, field.size).reshape(-1, *field.shape)
+        return mean + sigma * noise
+
+
+def source_of(port):
+    """An output that fits an input."""
+    if port.kind == "message":
+        return MessageOutput(fields=port.fields)
+    if port.is_bundle:
+        return BundleOutput(port.fields)
+    one = port.single
+    return Output(one.shape, unit=one.unit, frame=one.frame)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """What playback plays: attitude and position of 100 members, as if recorded on a run."""
+    folder = tmp_path_factory.mktemp("recording")
+    orbit, attitude = component_type("orbit"), component_type("lvlh_attitude")
+    played = {n: orbit._declared[n] for n in ("r_e", "v_e")}
+    played |= {n: attitude._declared[n] for n in ("q_be", "delta_v_b", "delta_theta_b")}
+    kind = type("Played", (Inputs,), {n: source_of(p) for n, p in played.items()})
+    system = System("recording")
+    made = system.add(kind(), name="original")
+    system.record("all", [made[n] for n in played])
+    simulate(system, members=max(SIZES), duration=WHOLE, out=folder / "recording.nc")
+    return folder / "recording.nc"
+
+
+@pytest.fixture(params=TYPES)
+def build(request, recording):
+    """A function that builds a system of one component and what drives it."""
+    kind = component_type(request.param)
+    settings = dict(SETTINGS.get(request.param, {}))
+    for name, value in (("result_file", recording), ("orbit_file", recording)):
+        if name in kind.settings():
+            settings |= {name: value, "source": "original"}
+
+    def build_system() -> System:
+        system = System("contract")
+        part = system.add(kind(rate=RATES.get(request.param, Rate(STEP)), **settings), name="part")
+        if part.inputs():
+            ports = {n: source_of(p) for n, p in part.inputs().items()}
+            drive = system.add(type("Drive", (Inputs,), ports)(), name="drive")
+            for name in ports:
+                system.connect(drive[name], part[name])
+        system.record("all", [part[n] for n in part.outputs()], period=STEP)
+        return system
+
+    build_system.kind = kind
+    return build_system
+
+
+def payload(dataset: xarray.Dataset, member=None) -> dict[str, bytes]:
+    """Bytes of every array of a result, or of one member in it."""
+    if member is not None:
+        dataset = dataset.sel(member=[member])
+    return {str(n): v.to_numpy().tobytes() for n, v in dataset.variables.items()}
+
+
+def test_a_member_of_an_ensemble_equals_the_same_member_alone(build):
+    """Ensembles of 1, 7 and 100, and the last of 100 alone: no member knows the others."""
+    flown = {n: simulate(build(), members=n, duration=WHOLE).dataset for n in SIZES}
+    for name, values in flown[100].data_vars.items():
+        assert np.isfinite(values.to_numpy()).any(), f"nothing was tested of {name}"
+    for member in range(7):
+        assert payload(flown[7], member) == payload(flown[100], member)
+    assert payload(flown[1], 0) == payload(flown[100], 0)
+    alone = simulate(build(), members=[99], duration=WHOLE).dataset
+    assert payload(alone) == payload(flown[100], 99)
+
+
+def test_the_same_system_gives_the_same_bytes_again(build):
+    system = build()
+    first = simulate(system, members=7, duration=WHOLE).dataset
+    assert payload(simulate(system, members=7, duration=WHOLE).dataset) == payload(first)
+
+
+def test_a_state_set_back_continues_to_the_same_bytes(build, tmp_path):
+    """In the same simulation, and in another one, through a file."""
+    whole = simulate(build(), members=7, duration=WHOLE).dataset
+    halted = Simulation(build(), members=7)
+    halted.run_until(HALF)
+    write_checkpoint(tmp_path / "half.ckpt", halted.get_state())
+    halted.run_until(WHOLE)
+    saved = read_checkpoint(tmp_path / "half.ckpt")
+    halted.set_state(saved)
+    halted.run_until(WHOLE)
+    assert payload(halted.result(wall_s=0.0).dataset) == payload(whole)
+    continued = Simulation(build(), members=7)
+    continued.set_state(saved)
+    continued.run_until(WHOLE)
+    times = [d for d in whole.dims if str(d).startswith("time")]
+    rest = whole.isel({d: whole[d] > float(HALF) for d in times})  # the half before is not copied
+    assert payload(continued.result(wall_s=0.0).dataset) == payload(rest)
+
+
+def test_ports_and_parameters_say_what_they_are(build):
+    kind = build.kind
+    assert kind.__doc__
+    for name, declared in kind._declared.items():
+        if isinstance(declared, Parameter) or not hasattr(declared, "fields"):
+            assert declared.doc, f"{kind.__name__}.{name} has no doc"
+            continue
+        for field in declared.fields.values():
+            assert declared.doc or field.doc or field.labels, f"{kind.__name__}.{name} has no doc"
+
+
+def test_parameters_are_read_back_as_they_were_written(build):
+    part = build().nodes["part"]
+    for name, setting in part.settings().items():
+        value = part.setting(name)
+        again = setting.read(setting.write(value), where=name, bare=False)
+        np.testing.assert_array_equal(again, value)
+
+
+def test_parameters_cannot_be_set_while_a_simulation_runs(build):
+    system = build()
+    part = system.nodes["part"]
+    Simulation(system)
+    for name in part.settings():
+        with pytest.raises(ConfigurationError, match=f"'part.{name}' cannot be set while"):
+            setattr(part, name, part.setting(name))
+
+
+def test_every_type_that_comes_with_terrafix_is_registered_and_tested():
+    folder = Path(__file__).parents[2] / "components"
+    public = {n for file in folder.glob("*.py") for n in _components(file)}
+    assert {component_entries()[n].value.split(":")[1] for n in TYPES} == public
+
+
+def _components(file: Path) -> list[str]:
+    """Names of the component classes that a module defines for use, from its text."""
+    tree = ast.parse(file.read_text())
+    classes = [n for n in tree.body if isinstance(n, ast.ClassDef) and n.name[0] != "_"]
+    bases = ("Component", "SymbolicComponent", "Evaluation", "_Playback")
+    return [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
