@@ -25,6 +25,7 @@ from terrafix.cosim.units import conversion_factor, split_quantity
 FloatArray = NDArray[np.float64]
 Value = TypeVar("Value")
 REQUIRED: Any = object()
+MOST_SHOWN = 9  # numbers in an error message
 
 
 def shown(value: object) -> str:
@@ -198,20 +199,24 @@ class Parameter(Setting[FloatArray]):
 
     def _check_finite(self, array: FloatArray, where: str) -> None:
         if np.isnan(array).any() or (not self.infinite and np.isinf(array).any()):
-            raise ConfigurationError(f"{where} is {array.tolist()}; it must be finite")
+            value = array.tolist() if array.size <= MOST_SHOWN else "not finite everywhere"
+            raise ConfigurationError(f"{where} is {value}; it must be finite")
 
     def _check_range(self, array: FloatArray, where: str) -> None:
         self._check_finite(array, where)
         unit = "" if self.unit in ("1", "") else f" {self.unit_text()}"
-        bad: str | None = None
-        if self.positive and (array <= 0).any():
-            bad = "must be positive"
-        elif self.minimum is not None and (array < self.minimum).any():
-            bad = f"must be at least {self.minimum:g}{unit}"
-        elif self.maximum is not None and (array > self.maximum).any():
-            bad = f"must be at most {self.maximum:g}{unit}"
-        if bad:
-            raise ConfigurationError(f"{where} is {array.tolist()}{unit}; it {bad}")
+        limits: list[tuple[NDArray[np.bool_], str]] = []
+        if self.positive:
+            limits.append((array <= 0.0, "must be positive"))
+        if self.minimum is not None:
+            limits.append((array < self.minimum, f"must be at least {self.minimum:g}{unit}"))
+        if self.maximum is not None:
+            limits.append((array > self.maximum, f"must be at most {self.maximum:g}{unit}"))
+        for wrong, must in limits:
+            if wrong.any():
+                few = array.size <= MOST_SHOWN
+                value = array.tolist() if few else float(array[wrong][0])
+                raise ConfigurationError(f"{where} is {value}{unit}; it {must}")
 
     def write(self, value: FloatArray) -> Any:
         """Write a value with its unit as text."""

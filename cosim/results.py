@@ -20,11 +20,21 @@ if TYPE_CHECKING:
     import xarray
 
 SCHEMA = "terrafix-result/1"
+LONGEST_NAME = 32  # of an axis named after all its labels
 
 
-def time_dimension(name: str, *, only: bool) -> str:
-    """Name of a recorder's time axis: ``time`` if it is the only one, else ``time_<record>``."""
-    return "time" if only else f"time_{name}"
+def time_axes(times: Mapping[str, NDArray[np.float64]]) -> dict[str, str]:
+    """Name of each record's time axis.
+
+    Records sampled at the same times share an axis: ``time`` if there is no other, else
+    ``time_<record>`` after the first of them.
+    """
+    first: dict[bytes, str] = {}
+    for record, values in times.items():
+        first.setdefault(values.tobytes(), record)
+    if len(first) == 1:
+        return dict.fromkeys(times, "time")
+    return {record: f"time_{first[values.tobytes()]}" for record, values in times.items()}
 
 
 def versions() -> dict[str, str]:
@@ -63,6 +73,8 @@ class _Labels:
             last = axis == len(shape) - 1
             if last and field.labels:
                 name = "_".join(["axis", *field.labels])
+                if len(name) > LONGEST_NAME:
+                    name = f"axis_{field.labels[0]}_to_{field.labels[-1]}"
                 self.coordinates[name] = list(field.labels)
             else:
                 name = f"dim_{size}"
@@ -97,8 +109,9 @@ def build_dataset(
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {"member": members}
     seen: set[str] = set()
+    axes = time_axes({record: times for record, (times, _) in records.items()})
     for record, (times, arrays) in records.items():
-        dimension = time_dimension(record, only=len(records) == 1)
+        dimension = axes[record]
         coordinates[dimension] = (dimension, times, {"units": "s", "long_name": "time"})
         for name, field, values in arrays:
             key = name if name not in seen else f"{name}@{record}"

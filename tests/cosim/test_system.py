@@ -41,7 +41,7 @@ def test_nested_systems_are_flattened_for_ordering(toys):
     result = simulate(system)
     assert spy.values() == [(1, 1), (2, 2)]
     assert result.dataset["nav.two.echo"].values[:, 0].tolist() == [0, 1, 2]
-    assert result.dataset["nav.one.echo"].dims[0] == "time_nav_inside"
+    assert result.dataset["nav.one.echo"].dims[0] == "time"
 
 
 def test_systems_nest_twice_and_may_be_wired_by_path(toys):

@@ -149,7 +149,7 @@ def build(kinds=("ekf", "ukf"), duration=7):
 
 def test_frames_come_at_exact_thirtieths_of_a_second():
     data = simulate(build(), members=2).dataset
-    np.testing.assert_array_equal(data["time_frames"].values, np.arange(211) / 30)
+    np.testing.assert_array_equal(data["time"].values, np.arange(211) / 30)
 
 
 def test_contours_are_ragged_and_then_absent():

@@ -161,7 +161,7 @@ def test_twenty_minutes_at_one_hertz():
     assert result.ticks == 1200
     # truth, matcher and three profiles each step 1200 times; the georeference only starts
     assert result.component_steps == 5 * 1200
-    assert result.dataset.sizes["time_frames"] == 1201
+    assert result.dataset.sizes["time"] == 1201
     present = int(np.isfinite(result.dataset["matcher.match.t"].values).sum())
     assert 0 < present < 5 * 1200
     assert {system.nodes[p].matches for p in PROFILES} == {present}
@@ -193,9 +193,9 @@ def test_a_profile_alone_sees_what_it_saw_in_company(skeleton):
 
 def test_fields_of_the_match_are_labeled():
     data = simulate(build_short(), members=2).dataset
-    assert data["matcher.match.offset"].dims == ("time_matches", "member", "axis_u_v")
+    assert data["matcher.match.offset"].dims == ("time", "member", "axis_u_v")
     assert data["matcher.match.offset"].attrs["units"] == "px"
-    assert data["matcher.match.peak"].dims == ("time_matches", "member")
+    assert data["matcher.match.peak"].dims == ("time", "member")
 
 
 @pytest.mark.parametrize("n", [1, 7, 100])
