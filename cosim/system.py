@@ -20,7 +20,13 @@ from typing import Any, Self, TypeVar
 from terrafix.cosim.clock import Exact, Rate, seconds
 from terrafix.cosim.component import Component, PortRef
 from terrafix.cosim.dispersion import Dispersion
-from terrafix.cosim.errors import ConfigurationError, RateError, WiringError, nearest
+from terrafix.cosim.errors import (
+    ConfigurationError,
+    RateError,
+    TerrafixError,
+    WiringError,
+    nearest,
+)
 from terrafix.cosim.ports import Port
 from terrafix.cosim.wiring import check_connection
 
@@ -267,6 +273,38 @@ class System:
         for node in self.nodes.values():
             if isinstance(node, System):
                 yield from node._systems()
+
+    def replace(self, name: str, node: Node) -> Node:
+        """Put another component in the place of one, on the same ports, and return it.
+
+        What the old one read is connected where the new one has that input too; everything that
+        others read from it must be there.
+
+        Raises
+        ------
+        ConfigurationError
+            If there is no such component.
+        WiringError
+            If a port that is read is missing or does not fit.
+        """
+        nodes, connections = dict(self.nodes), list(self.connections)
+        self.remove(name)
+        try:
+            self.add(node, name)
+            self.connections = []
+            for c in connections:
+                owner, _, port = c.target.partition(".")
+                if owner == name and isinstance(node, Component) and port not in node.inputs():
+                    continue
+                self.connect(c.source, c.target, delay=c.delay)
+        except TerrafixError:
+            if isinstance(node, Component):
+                node.name = ""
+            self.nodes, self.connections = nodes, connections
+            if isinstance(old := nodes[name], Component):
+                old.name = name
+            raise
+        return node
 
     def _path(self, port: PortRef | str) -> str:
         if isinstance(port, str):

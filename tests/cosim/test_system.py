@@ -164,6 +164,29 @@ def test_a_component_is_replaced_by_another_on_the_same_ports(toys):
     assert old.name == ""
 
 
+def test_replacing_keeps_the_connections(toys):
+    class Playback(toys.Clock):
+        def _publish(self, t):
+            self.t = 100 + t
+
+    spy = toys.EndSpy()
+    system = toys.wire({"truth": toys.Clock(), "spy": spy}, ["truth.t -> spy.u"])
+    system.replace("truth", Playback())
+    toys.fly(system, 1)
+    assert spy.values() == [(1, 101)]
+
+
+def test_a_component_that_does_not_fit_replaces_nothing(toys):
+    system = toys.wire({"truth": toys.Clock(), "spy": toys.EndSpy()}, ["truth.t -> spy.u"])
+    before = list(system.connections)
+    misfit = toys.EndSpy()
+    with pytest.raises(WiringError, match="'truth' has no port 't'"):
+        system.replace("truth", misfit)
+    assert system.connections == before
+    assert (system.nodes["truth"].name, misfit.name) == ("truth", "")
+    check(system)
+
+
 class Needy(Component):
     needed = Parameter(unit="m")
     u = Input((3,), unit="m", frame="e")

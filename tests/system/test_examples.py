@@ -96,7 +96,8 @@ def test_what_the_examples_leave_out_survives_being_written_and_read(tmp_path):
     text = (EXAMPLES / "spacecraft_sar_open_loop.toml").read_text()
     doc = r'doc = "a \\"quoted\\" text\\nof two lines \\\\ é"'
     text = re.sub('doc = """.*?"""', doc, text, count=1, flags=re.DOTALL)
-    text = text.replace('"antenna.q_mu -> sar.q_mu"', '"nav.q_mu -> sar.q_mu (delay 1/3 s)"')
+    text = text.replace('"sar.fix -> correct.fix"', '"sar.fix -> correct.fix (delay 1/3 s)"')
+    text = text.replace('"antenna.q_mu -> evaluation.q_mu"', '"nav.q_mu -> evaluation.q_mu"')
     text = text.replace("underweighting = 0.2", 'underweighting = 0.2\ngate = "[9, inf, inf, 20]"')
     (tmp_path / "outer.toml").write_text(
         text + '\n[component.nav]\ntype = "system"\nfile = "inner.toml"\n'
