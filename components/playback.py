@@ -6,6 +6,7 @@ bytes; an orbit file is interpolated.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -107,6 +108,16 @@ class Recording:
                 except ConfigurationError as error:
                     raise ConfigurationError(f"'{self.component.name}': {error}") from None
 
+    def check_end(self, last: float) -> None:
+        """Raise ConfigurationError if a port was not recorded until `last` [s]."""
+        for name, (times, _) in self.samples.items():
+            if times[-1] < last - CLOSE:
+                raise ConfigurationError(
+                    f"'{self.component.name}' is to play '{name}' until {last:g} s, but "
+                    f"'{self.path.name}' ends at {times[-1]:g} s\n"
+                    "  fly shorter (--duration), or record the original longer"
+                )
+
     def choose(self, members: NDArray[np.int64]) -> None:
         """Keep the members that are flown; the only one of a recording serves all."""
         if len(self.members) == 1:
@@ -141,6 +152,19 @@ class Recording:
                 f"{span}\n  record the original whenever it steps, and play it at the same rate"
             )
         return k
+
+
+def last_step(rate: Rate | None, duration: float) -> float:
+    """Time of the last step within a run [s]; 0 if there is none."""
+    if rate is None:
+        return 0.0
+    if rate.times is not None:
+        return max((float(t) for t in rate.times if t <= duration), default=0.0)
+    assert rate.period is not None
+    period, offset = float(rate.period), float(rate.offset)
+    if duration < offset:
+        return 0.0
+    return offset + math.floor((duration - offset) / period + CLOSE) * period
 
 
 class RecordedOrbit(Component):
@@ -199,6 +223,18 @@ class RecordedOrbit(Component):
             )
         return ephemeris
 
+    def validate_duration(self, duration: float) -> None:
+        """Read the file and look whether it covers the run."""
+        orbit, last = self._read(), float(self.setting("start")) + last_step(self.rate, duration)
+        if isinstance(orbit, Recording):
+            orbit.check_end(last)
+        elif last > orbit.t[-1]:
+            raise ConfigurationError(
+                f"'{self.name}' is to play until {last:g} s after the first state of "
+                f"'{self.setting('orbit_file').name}', which covers {orbit.t[-1]:g} s\n"
+                f"  fly shorter (--duration), or set an earlier {self.name}.start"
+            )
+
     def bind(self, environment: Environment) -> None:
         """Read the file."""
         super().bind(environment)
@@ -248,6 +284,10 @@ class _Playback(Component):
     def validate(self) -> None:
         """Read the file and find what is needed in it."""
         self._read()
+
+    def validate_duration(self, duration: float) -> None:
+        """Read the file and look whether it covers the run."""
+        self._read().check_end(last_step(self.rate, duration))
 
     def _read(self) -> Recording:
         recording = Recording(

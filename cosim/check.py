@@ -48,8 +48,14 @@ class Plan:
     notes: list[str]
 
 
-def check(system: System) -> Plan:
+def check(system: System, *, duration: Fraction | None = None) -> Plan:
     """Check a system whole.
+
+    Parameters
+    ----------
+    system : System
+    duration : Fraction, optional
+        Of the run that is meant [s]: recordings that end before it are found too.
 
     Raises
     ------
@@ -91,6 +97,8 @@ def check(system: System) -> Plan:
             )
         if not missing and not refused:
             attempt(component.validate)
+            if duration is not None:
+                attempt(lambda c=component: c.validate_duration(float(duration)))  # type: ignore[misc]
         for port in component.ports.values():
             for field in port.fields.values():
                 attempt(lambda f=field: _check_units(f))  # type: ignore[misc]

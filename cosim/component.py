@@ -201,6 +201,9 @@ class Component:
     def validate(self) -> None:
         """Raise ConfigurationError if the parameters cannot work (files, combinations)."""
 
+    def validate_duration(self, duration: float) -> None:
+        """Raise ConfigurationError if it cannot serve a run of `duration` [s] (a recording)."""
+
     def bind(self, environment: Environment) -> None:
         """Get arrays for states and parameters; called once, before ports are bound."""
         self._environment = environment

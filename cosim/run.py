@@ -114,6 +114,8 @@ class Simulation:
         How many members, or which (a part of an ensemble keeps its numbers and draws).
     seed : int, optional
         Root seed; the system's own if absent.
+    duration : exact time, optional
+        How long it will run [s]: recordings that end earlier are refused.
     folder : Path, optional
         Where records are kept while the run goes on.
 
@@ -134,12 +136,14 @@ class Simulation:
         *,
         members: int | Sequence[int] | None = None,
         seed: int | None = None,
+        duration: Exact | None = None,
         folder: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
         started = time.perf_counter()
         self.system = system
-        self.plan: Plan = check(system)
+        length = None if duration is None else seconds(duration, "duration")
+        self.plan: Plan = check(system, duration=length)
         self.members = _member_numbers(system.members if members is None else members)
         self.seed = system.seed if seed is None else seed
         self.folder = folder
@@ -396,7 +400,9 @@ def simulate(
         raise RateError(f"checkpoint interval is {text_seconds(every)} s; it must be positive")
     target = _checkpoint_path(system, checkpoint or resume, out)
     folder = _folder(out, target if every is not None or saved is not None else None)
-    simulation = Simulation(system, members=members, seed=seed, folder=folder, progress=progress)
+    simulation = Simulation(
+        system, members=members, seed=seed, duration=length, folder=folder, progress=progress
+    )
     try:
         _refuse_impossible(simulation, length, saved, every)
         if folder is not None and saved is None:
@@ -604,10 +610,13 @@ def _versions() -> dict[str, str]:
     return versions()
 
 
+_OTHER = {"system": "another system", "seed": "another seed", "members": "other members"}
+
+
 def _difference(key: str, mine: Any, theirs: Any) -> str:
     if key != "configuration":
         return (
-            f"the checkpoint belongs to another {key}: {theirs!r} there, {mine!r} here\n"
+            f"the checkpoint belongs to {_OTHER[key]}: {theirs!r} there, {mine!r} here\n"
             f"  resume it with the {key} it was made with"
         )
     for part, values in mine.items():

@@ -250,12 +250,20 @@ class SymbolicComponent(Component):
             results = results if isinstance(results, tuple) else (results,)
             values = [np.asarray(r, dtype=np.float64).reshape(-1) for r in results]
             if not all(np.isfinite(v).all() for v in values):
-                self.fail(env.members == env.members[m], "start is not finite")
+                self.fail(env.members == env.members[m], self._unfinished_start(m))
                 continue
             for target, value in zip(targets, values, strict=True):
                 target[m] = value.reshape(target.shape[1:])
         if self.publishes_at_start:
             self._publish_messages(0.0)
+
+    def _unfinished_start(self, m: int) -> str:
+        """Why the start of member number `m` is not finite, as far as its inputs tell."""
+        signals = [n for n in self.model.inputs if self.ports[n.partition(".")[0]].kind == "signal"]
+        unwritten = [n for n in signals if not np.isfinite(self._input_array(n)[m]).all()]
+        if not unwritten:
+            return "start is not finite"
+        return f"start is not finite: nothing was published at t = 0 for {', '.join(unwritten)}"
 
     def _step_impl(self, t: float, dt: float) -> None:
         self._t[0] = t

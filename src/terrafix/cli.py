@@ -302,7 +302,8 @@ def check(system: str, settings: Settings, as_json: bool) -> None:
     from terrafix.cosim.check import check as check_system
     from terrafix.cosim.listing import plan_content, plan_tables
 
-    plan = check_system(_read(system, settings))
+    loaded = _read(system, settings)
+    plan = check_system(loaded, duration=loaded.duration)
     if as_json:
         _print_json(plan_content(plan))
     else:

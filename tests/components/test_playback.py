@@ -172,10 +172,15 @@ def test_recordings_that_cannot_be_played_are_refused_before_the_run(tmp_path, o
     assert "has no sample of 'r_e' at 18 s" in attempt("orbit", file, start="18 s")
 
 
-def test_a_run_beyond_the_recording_stops_and_says_so(tmp_path, original):
+def test_a_run_beyond_the_recording_is_refused_before_it_starts(tmp_path, original):
     _, file = original
-    with pytest.raises(StepError, match=r"'imu' failed at t = 17\.01 s(.|\n)*from 0 s to 17 s"):
-        fly(with_playback(tmp_path, "imu", definition("imu", file)), members=1, duration="18")
+    path = with_playback(tmp_path, "imu", definition("imu", file))
+    with pytest.raises(SystemCheckError) as caught:
+        simulate(read_system(path), members=MEMBERS, duration="18")
+    assert [str(p) for p in caught.value.problems] == [
+        f"'imu' is to play 'delta_v_b' until 18 s, but '{file.name}' ends at 17 s\n"
+        "  fly shorter (--duration), or record the original longer"
+    ]
 
 
 def test_a_member_that_was_not_recorded_fails_and_the_others_fly_on(tmp_path, original):
@@ -284,12 +289,15 @@ def test_orbit_files_that_cannot_be_used_are_refused_before_the_run(tmp_path, eo
     )
 
 
-def test_a_run_beyond_the_orbit_file_stops_and_keeps_what_it_recorded(tmp_path, eof):
-    with pytest.raises(StepError, match=r"'orbit' failed at t = 10\.1 s(.|\n)*extrapolate") as stop:
-        fly(orbit_system(tmp_path, eof, start="290 s"), members=1)
-    recorded = stop.value.result.dataset["orbit.r_e"]
-    assert len(recorded) == 101
-    assert np.isfinite(recorded).all()
+def test_a_run_beyond_the_orbit_file_is_refused_before_it_starts(tmp_path, eof):
+    system = read_system(orbit_system(tmp_path, eof, start="250 s"))
+    simulate(system, duration="50")
+    with pytest.raises(SystemCheckError) as caught:
+        simulate(system, duration="51")
+    assert str(caught.value.problems[0]) == (
+        "'orbit' is to play until 301 s after the first state of 'circle.EOF', which covers 300 s\n"
+        "  fly shorter (--duration), or set an earlier orbit.start"
+    )
 
 
 def test_the_real_orbit_of_sentinel_1_is_flown():

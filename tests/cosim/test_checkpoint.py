@@ -214,7 +214,7 @@ def interrupted(toys, tmp_path):
     ("change", "options", "text"),
     [
         ({}, {"seed": 4}, "belongs to another seed: 3 there, 4 here\n  resume it with the seed"),
-        ({}, {"members": 5}, r"another members: \[0, 1, 2, 3\] there, \[0, 1, 2, 3, 4\] here"),
+        ({}, {"members": 5}, r"other members: \[0, 1, 2, 3\] there, \[0, 1, 2, 3, 4\] here"),
         ({"name": "other"}, {}, "another system: 'test' there, 'other' here"),
         ({"setting": 5.0}, {}, "made with other components: 'walk' is\n"),
         ({"rate": Rate(4)}, {}, "made with other components: 'all' is\n"),

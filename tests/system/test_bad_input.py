@@ -905,7 +905,7 @@ def test_checkpoints_that_do_not_belong_are_refused(small, tmp_path):
         "  resume it with the seed it was made with"
     )
     assert small(resume=checkpoint, members=7) == (
-        "CheckpointError: the checkpoint belongs to another members: [0] there, "
+        "CheckpointError: the checkpoint belongs to other members: [0] there, "
         "[0, 1, 2, 3, 4, 5, 6] here\n  resume it with the members it was made with"
     )
     assert small(resume=checkpoint, duration="1 s") == (
