@@ -25,7 +25,8 @@ from terrafix.cosim.component import Component
 from terrafix.cosim.files import read_system
 from terrafix.cosim.ports import Input, Output
 from terrafix.cosim.results import cpu_name, versions
-from terrafix.cosim.run import Simulation, simulate
+from terrafix.cosim.run import simulate
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
 
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_open_loop.toml"

@@ -15,7 +15,7 @@ from rich.text import Text
 from terrafix.cosim.display import is_consistency, is_quantity, number, shown_unit, summaries
 
 if TYPE_CHECKING:
-    from terrafix.cosim.run import Result
+    from terrafix.cosim.simulation import Result
 
 NAMED_MEMBERS = 8  # numbers of excluded members that are listed before "..."
 

@@ -50,7 +50,7 @@ def main(*, members: int = 50, plot: str | None = None) -> Result:
 
     result = simulate(system, members=members, seed=1)
     last = result.dataset["altimeter.height"][-1].to_numpy()
-    print(f"height {np.mean(last) / 1e3:.3f} km, spread of its readings {np.std(last, ddof=1):.1f} m")
+    print(f"height {np.mean(last) / 1e3:.3f} km, spread of readings {np.std(last, ddof=1):.1f} m")
     if plot is not None:
         from terrafix.cosim.plots import plot_result
 

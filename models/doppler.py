@@ -25,7 +25,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import fft
 
 from terrafix.models.chirp import ComplexArray, Radar
 from terrafix.models.model import FloatArray

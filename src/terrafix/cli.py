@@ -18,7 +18,7 @@ import click
 from terrafix.cosim.errors import ConfigurationError, StepError, SystemCheckError, TerrafixError
 
 if TYPE_CHECKING:
-    from terrafix.cosim.run import Result
+    from terrafix.cosim.simulation import Result
     from terrafix.cosim.system import System
 
 FAILED, REFUSED = 1, 2

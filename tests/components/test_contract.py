@@ -19,7 +19,8 @@ from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.parameters import Parameter
 from terrafix.cosim.ports import BundleOutput, MessageOutput, Output
 from terrafix.cosim.registry import component_entries, component_type
-from terrafix.cosim.run import Simulation, simulate
+from terrafix.cosim.run import simulate
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
 from terrafix.models.attitude import lvlh_quaternion_array
 

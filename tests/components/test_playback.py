@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafix.cosim.errors import ConfigurationError, StepError, SystemCheckError
+from terrafix.cosim.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.files import read_system
 from terrafix.cosim.run import simulate
 from terrafix.models.earth import EARTH

@@ -18,7 +18,7 @@ from terrafix.cosim.ports import (
     State,
     WindowInput,
 )
-from terrafix.cosim.run import Simulation
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
 
 

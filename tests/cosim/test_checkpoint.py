@@ -23,7 +23,8 @@ from terrafix.cosim.ports import (
     WindowInput,
 )
 from terrafix.cosim.results import read_result
-from terrafix.cosim.run import RunError, Simulation, simulate
+from terrafix.cosim.run import RunError, simulate
+from terrafix.cosim.simulation import Simulation
 
 
 class Everything(Component):

@@ -5,7 +5,8 @@ import pytest
 
 from terrafix.cosim.dispersion import Dispersion
 from terrafix.cosim.errors import ConfigurationError, SystemCheckError
-from terrafix.cosim.run import Simulation, simulate
+from terrafix.cosim.run import simulate
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
 
 

@@ -10,7 +10,8 @@ from terrafix.cosim.component import Component
 from terrafix.cosim.dispersion import Dispersion
 from terrafix.cosim.errors import ConfigurationError, StepError
 from terrafix.cosim.ports import Input, Output
-from terrafix.cosim.run import RunError, Simulation, simulate
+from terrafix.cosim.run import RunError, simulate
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
 
 

@@ -10,7 +10,8 @@ from terrafix.cosim.dispersion import Dispersion
 from terrafix.cosim.errors import ConfigurationError, RateError, SystemCheckError, WiringError
 from terrafix.cosim.parameters import Parameter
 from terrafix.cosim.ports import Input, Output
-from terrafix.cosim.run import Simulation, simulate
+from terrafix.cosim.run import simulate
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
 
 

@@ -28,7 +28,8 @@ from terrafix.cosim.ports import (
     SharedOutput,
     State,
 )
-from terrafix.cosim.run import Simulation, simulate
+from terrafix.cosim.run import simulate
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.symbolic import SymbolicComponent
 from terrafix.cosim.system import System
 from terrafix.models.model import Model

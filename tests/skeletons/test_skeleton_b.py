@@ -25,7 +25,8 @@ from terrafix.cosim.ports import (
     State,
     WindowInput,
 )
-from terrafix.cosim.run import Simulation, simulate
+from terrafix.cosim.run import simulate
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
 
 IMU, PRF, APERTURE = Rate(hz=100), Rate(hz=1200), Rate(1)

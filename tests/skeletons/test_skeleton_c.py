@@ -23,7 +23,8 @@ from terrafix.cosim.ports import (
     SharedOutput,
     State,
 )
-from terrafix.cosim.run import Simulation, simulate
+from terrafix.cosim.run import simulate
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
 
 FRAME = np.array([320.0, 256.0])  # [px]

@@ -14,7 +14,8 @@ from terrafix.cosim.component import Component
 from terrafix.cosim.dispersion import Dispersion
 from terrafix.cosim.parameters import Choice, Parameter
 from terrafix.cosim.ports import Field, Input, MessageInput, MessageOutput, Output, State
-from terrafix.cosim.run import Simulation, simulate
+from terrafix.cosim.run import simulate
+from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
 
 MATCH = {"offset": Field((2,), "px", labels=("u", "v")), "peak": Field()}

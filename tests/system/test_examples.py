@@ -15,7 +15,8 @@ import xarray
 from terrafix.cosim.check import check
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.files import read_system
-from terrafix.cosim.run import configuration, simulate
+from terrafix.cosim.identity import configuration
+from terrafix.cosim.run import simulate
 from terrafix.cosim.system import System
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

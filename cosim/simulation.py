@@ -1,0 +1,347 @@
+"""A system built for one ensemble: components bound, kernels made, recorders set; its result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.cosim.buffers import SignalSlot
+from terrafix.cosim.check import Plan, check, record_rate
+from terrafix.cosim.clock import Exact, seconds, text_seconds
+from terrafix.cosim.errors import (
+    CheckpointError,
+    ConfigurationError,
+)
+from terrafix.cosim.evaluation import Evaluation
+from terrafix.cosim.identity import configuration, difference
+from terrafix.cosim.kernels import build_kernels
+from terrafix.cosim.master import Master
+from terrafix.cosim.parameters import Parameter
+from terrafix.cosim.record import Recorder, write_manifest
+from terrafix.cosim.symbolic import SymbolicComponent
+from terrafix.cosim.system import System
+
+if TYPE_CHECKING:
+    import xarray
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the fraction done, often."""
+MAX_MEMBER = 2**32 - 1  # a word of the counter that noise is drawn from
+
+
+@dataclass
+class Result:
+    """What a run gives back.
+
+    Attributes
+    ----------
+    system : str
+        Name of the system.
+    seed : int
+    members : int
+        Number of members flown.
+    excluded : list of dict
+        Failed members: ``member``, ``component``, ``t_s``, ``reason``.
+    ticks, component_steps : int
+    wall_s, setup_s : float
+        Running time, and the time to check, build and compile before it.
+    kernel : str
+        Which kind of kernel stepped the symbolic components.
+    evaluation : dict
+        What the evaluation component publishes; with several, by component path.
+    dataset : xarray.Dataset
+        Records, parameters as they reached the components, configuration.
+    status : str
+        ``"complete"`` or what ended the run early.
+    """
+
+    system: str
+    seed: int
+    members: int
+    excluded: list[dict[str, Any]]
+    ticks: int
+    component_steps: int
+    wall_s: float
+    setup_s: float
+    kernel: str
+    evaluation: dict[str, Any]
+    dataset: xarray.Dataset
+    status: str = "complete"
+    overruns: dict[str, int] = field(default_factory=dict)
+    out: Path | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """Plain types for JSON."""
+        names = (
+            "system seed members excluded ticks component_steps wall_s setup_s kernel "
+            "evaluation status overruns"
+        )
+        return {n: getattr(self, n) for n in names.split()}
+
+
+class Simulation:
+    """A system built for one ensemble: what `simulate` runs, for use step by step.
+
+    Parameters
+    ----------
+    system : System
+    members : int or sequence of int, optional
+        How many members, or which (a part of an ensemble keeps its numbers and draws).
+    seed : int, optional
+        Root seed; the system's own if absent.
+    duration : exact time, optional
+        How long it will run [s]: recordings that end earlier are refused.
+    folder : Path, optional
+        Where records are kept while the run goes on.
+
+    Attributes
+    ----------
+    checkpoint : Path or None
+        What an interrupted run can be resumed from.
+
+    Raises
+    ------
+    SystemCheckError
+        With every problem of the system.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        *,
+        members: int | Sequence[int] | None = None,
+        seed: int | None = None,
+        duration: Exact | None = None,
+        folder: Path | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        started = time.perf_counter()
+        self.system = system
+        length = None if duration is None else seconds(duration, "duration")
+        self.plan: Plan = check(system, duration=length)
+        self.members = _member_numbers(system.members if members is None else members)
+        self.seed = system.seed if seed is None else seed
+        self.folder = folder
+        self.checkpoint: Path | None = None
+        try:
+            self.master = Master(self.plan, seed=self.seed, members=self.members)
+            self.kernel = self._build_kernels(progress)
+            self.recorders = self._make_recorders()
+        except BaseException:
+            for component in self.plan.flat.components.values():
+                component.release()
+            raise
+        self.parameters = self._read_back()
+        self.configuration = configuration(self.plan)
+        self.initialized = False
+        self.setup_s = time.perf_counter() - started
+
+    def _build_kernels(self, progress: Progress | None) -> str:
+        symbolic = {
+            p: c for p, c in self.plan.flat.components.items() if isinstance(c, SymbolicComponent)
+        }
+        if not symbolic:
+            return "none"
+        requests = [c.kernel_request() for c in symbolic.values()]
+
+        def report(done: int, total: int) -> None:
+            if progress is not None:
+                progress("compiling kernels", done / total)
+
+        kernels = build_kernels(requests, progress=report)
+        for component, kernel in zip(symbolic.values(), kernels, strict=True):
+            component.bind_kernel(kernel)
+        return "+".join(sorted({k.kind for k in kernels}))
+
+    def _make_recorders(self) -> list[Recorder]:
+        recorders = []
+        flat, wiring = self.plan.flat, self.master.wiring
+
+        def recorder(name: str, ports: Sequence[str]) -> Recorder:
+            slots = {}
+            for path in ports:
+                slot = wiring.slots[path]
+                assert isinstance(slot, SignalSlot)
+                slots[path] = (flat.port(path), slot)
+            return Recorder(name, slots, self.master.active, self.folder)
+
+        for record in flat.records:
+            made = recorder(record.name, record.ports)
+            self.master.observe(record_rate(flat, record), made.sample)
+            recorders.append(made)
+        self._histories: dict[str, Recorder] = {}
+        taken = {r.name for r in flat.records}
+        for path, component in flat.components.items():
+            if isinstance(component, Evaluation):
+                name = path.replace(".", "_")
+                while name in taken:
+                    name += "_history"
+                taken.add(name)
+                made = recorder(name, [f"{path}.{p}" for p in component.recorded_ports()])
+                assert component.rate is not None
+                self.master.observe(component.rate, made.sample)
+                recorders.append(made)
+                self._histories[path] = made
+        return recorders
+
+    def _read_back(self) -> dict[str, tuple[str, NDArray[Any]]]:
+        """Dispersed parameters as they reached the components."""
+        found = {}
+        for dispersion in self.plan.flat.dispersions:
+            for target in dispersion.targets:
+                owner, _, name = target.rpartition(".")
+                component = self.plan.flat.components[owner]
+                declared = component.settings()[name]
+                assert isinstance(declared, Parameter)
+                found[target] = (declared.unit_text(), component._settings[name].copy())
+        return found
+
+    # ------------------------------------------------------------------ running
+
+    def initialize(self) -> None:
+        """Publish everything at t = 0."""
+        self._initialize(observe=True)
+
+    def _initialize(self, *, observe: bool) -> None:
+        if self.folder is not None:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_manifest(self.folder, self.recorders, self.attributes("interrupted"))
+        self.master.initialize(observe=observe)
+        self.initialized = True
+
+    def run_until(self, t: Exact) -> None:
+        """Step to time `t` [s]; initializes first if that was not done."""
+        if not self.initialized:
+            self.initialize()
+        self.master.run_until(self.master.ticks(seconds(t, "time")))
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything that is needed to continue from here in another process."""
+        from terrafix.cosim.results import versions
+
+        return {
+            "master": self.master.get_state(),
+            "recorders": {r.name: r.get_state() for r in self.recorders},
+            "identity": self._identity(),
+            "versions": versions(),
+        }
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Continue from a saved state.
+
+        Raises
+        ------
+        CheckpointError
+            If it belongs to another system, seed or ensemble; the difference is named.
+        """
+        mine, theirs = self._identity(), saved["identity"]
+        differing = [k for k in mine if mine[k] != theirs.get(k)]
+        if differing:
+            key = differing[0]
+            raise CheckpointError(difference(key, mine[key], theirs.get(key)))
+        if self.folder is not None and not self.folder.is_dir():
+            raise CheckpointError(
+                f"the records that belong to the checkpoint are gone: there is no folder "
+                f"'{self.folder}'\n"
+                "  a run that has ended keeps them in its result; start again without --resume"
+            )
+        if not self.initialized:
+            self._initialize(observe=False)
+        self.master.set_state(saved["master"])
+        for recorder in self.recorders:
+            recorder.set_state(saved["recorders"][recorder.name])
+
+    def _identity(self) -> dict[str, Any]:
+        return {
+            "system": self.system.name,
+            "seed": self.seed,
+            "members": [int(m) for m in self.members],
+            "configuration": self.configuration,
+        }
+
+    # ------------------------------------------------------------------ results
+
+    def attributes(self, status: str) -> dict[str, Any]:
+        """What is stored with every result."""
+        from terrafix.cosim.results import cpu_name, versions
+
+        return {
+            "system": self.system.name,
+            "doc": self.system.doc,
+            "status": status,
+            "seed": self.seed,
+            "members": [int(m) for m in self.members],
+            "excluded": self.master.excluded,
+            "base_step_s": text_seconds(self.plan.base),
+            "order": self.plan.order,
+            "kernel": self.kernel,
+            "versions": versions(),
+            "cpu": cpu_name(),
+            "configuration": self.configuration,
+        }
+
+    def evaluate(self) -> dict[str, Any]:
+        """What evaluation components publish, from what was recorded so far."""
+        found = {}
+        for path, recorder in self._histories.items():
+            component = self.plan.flat.components[path]
+            assert isinstance(component, Evaluation)
+            times, arrays = recorder.history()
+            history = {n.removeprefix(f"{path}."): a for n, a in arrays.items()}
+            found[path] = component.summarize(times, history)
+        return next(iter(found.values())) if len(found) == 1 else found
+
+    def result(self, *, wall_s: float, status: str = "complete") -> Result:
+        """Gather what was recorded."""
+        from terrafix.cosim.results import build_dataset, from_recorders
+
+        try:
+            evaluation = self.evaluate()
+        except Exception:
+            if status == "complete":
+                raise
+            evaluation = {}  # a history cut short must not cost the records
+        attributes = self.attributes(status) | {"evaluation": evaluation}
+        dataset = build_dataset(
+            from_recorders(self.recorders), self.members, attributes, self.parameters
+        )
+        readers = self.master.wiring.readers
+        return Result(
+            system=self.system.name,
+            seed=self.seed,
+            members=len(self.members),
+            excluded=list(self.master.excluded),
+            ticks=self.master.tick,
+            component_steps=self.master.component_steps,
+            wall_s=wall_s,
+            setup_s=self.setup_s,
+            kernel=self.kernel,
+            evaluation=evaluation,
+            dataset=dataset,
+            status=status,
+            overruns={path: r.overruns for path, r in readers.items() if r.overruns},
+        )
+
+
+def _member_numbers(members: int | Sequence[int]) -> NDArray[np.int64]:
+    if isinstance(members, bool) or (isinstance(members, int) and members < 1):
+        raise ConfigurationError(f"members is {members}; an ensemble has at least 1")
+    numbers = np.arange(members) if isinstance(members, int) else np.asarray(members)
+    if (
+        numbers.ndim != 1
+        or not len(numbers)
+        or numbers.dtype.kind not in "iu"
+        or len(set(numbers.tolist())) != len(numbers)
+        or numbers.min() < 0
+        or numbers.max() > MAX_MEMBER
+    ):
+        raise ConfigurationError(
+            f"members {members} must be different whole numbers from 0 to {MAX_MEMBER}"
+        )
+    return numbers.astype(np.int64)
