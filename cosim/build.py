@@ -12,16 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.cosim.buffers import (
-    BundleView,
-    MessageReader,
-    MessageSlot,
-    MessageWriter,
-    SharedSlot,
-    SignalSlot,
-    WindowView,
-    _read_only,
-)
+from terrafix.cosim.buffers import BundleView, SharedSlot, SignalSlot, WindowView, read_only
 from terrafix.cosim.check import Plan
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component, Environment
@@ -33,6 +24,7 @@ from terrafix.cosim.links import (
     Transfer,
     default_slot,
 )
+from terrafix.cosim.messages import MessageReader, MessageSlot, MessageWriter
 from terrafix.cosim.ports import Port
 from terrafix.cosim.system import Connection
 from terrafix.cosim.wiring import port_factor
@@ -139,7 +131,7 @@ def _unconnected(component: Component, name: str, port: Port[Any], n_members: in
 
 
 def _signal_view(port: Port[Any], slot: SignalSlot) -> Any:
-    return BundleView(slot.views, writable=False) if port.is_bundle else _read_only(slot.views[""])
+    return BundleView(slot.views, writable=False) if port.is_bundle else read_only(slot.views[""])
 
 
 def _connect(

@@ -13,7 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.cosim.buffers import MessageSlot, Saved, SharedSlot, SignalSlot
+from terrafix.cosim.buffers import Saved, SharedSlot, SignalSlot
+from terrafix.cosim.messages import MessageSlot
 
 FloatArray = NDArray[np.float64]
 

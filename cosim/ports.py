@@ -28,12 +28,9 @@ from numpy.typing import DTypeLike, NDArray
 from terrafix.cosim.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from terrafix.cosim.buffers import (  # noqa: F401 - in quotes below: what a port shows
-        BundleView,
-        MessageReader,
-        MessageWriter,
-        WindowView,
-    )
+    # in quotes below: what a port shows
+    from terrafix.cosim.buffers import BundleView, WindowView  # noqa: F401
+    from terrafix.cosim.messages import MessageReader, MessageWriter  # noqa: F401
 
 FloatArray = NDArray[np.float64]
 Unit = str | tuple[str, ...]

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.cosim.buffers import MessageSlot, SignalSlot
+from terrafix.cosim.buffers import SignalSlot
 from terrafix.cosim.errors import ConfigurationError
+from terrafix.cosim.messages import MessageSlot
 from terrafix.cosim.ports import Field, Port
 
 Arrays = dict[str, NDArray[Any]]

@@ -18,10 +18,11 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.cosim.buffers import BundleView, MessageReader, MessageWriter
+from terrafix.cosim.buffers import BundleView
 from terrafix.cosim.component import Component, Environment
 from terrafix.cosim.errors import ConfigurationError, nearest
 from terrafix.cosim.kernels import Argument, BoundKernel, Kernel, Result, Specification
+from terrafix.cosim.messages import MessageReader, MessageWriter
 from terrafix.cosim.noise import stream_key
 from terrafix.cosim.parameters import Parameter
 from terrafix.cosim.ports import Capabilities
