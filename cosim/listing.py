@@ -18,7 +18,7 @@ from terrafix.cosim.component import Component
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.parameters import Setting
 from terrafix.cosim.ports import Port
-from terrafix.cosim.registry import component_entries, component_type
+from terrafix.cosim.registry import component_entries, component_type, type_name
 
 # ---------------------------------------------------------------------- a checked system
 
@@ -33,7 +33,7 @@ def plan_content(plan: Plan) -> dict[str, Any]:
         "base_step": f"{text_seconds(plan.base)} s",
         "order": list(plan.order),
         "components": {
-            path: {"type": type(flat.components[path]).__name__, "rate": _rate(flat, path)}
+            path: {"type": type_name(type(flat.components[path])), "rate": _rate(flat, path)}
             for path in plan.order
         },
         "connections": [
@@ -59,7 +59,7 @@ def plan_tables(plan: Plan) -> list[Any]:
     flat = plan.flat
     table = _table("", "component", "type", "steps")
     for number, path in enumerate(plan.order, 1):
-        kind = type(flat.components[path]).__name__
+        kind = type_name(type(flat.components[path]))
         table.add_row(str(number), path, kind, escape(_rate(flat, path)))
     shown: list[Any] = [
         Text(
@@ -134,7 +134,7 @@ def _port_content(name: str, port: Port[Any]) -> dict[str, Any]:
         }
         for n, f in port.fields.items()
     ]
-    content = {
+    content: dict[str, Any] = {
         "name": name,
         "direction": "input" if port.is_input else "output",
         "kind": "window" if port.window else port.kind,

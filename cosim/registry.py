@@ -47,3 +47,9 @@ def component_type(name: str) -> type[Component]:
             f"component type '{name}' ({entries[name].value}) is not a terrafix Component"
         )
     return found
+
+
+def type_name(kind: type[Component]) -> str:
+    """Name under which a class is registered, else the name of the class."""
+    value = f"{kind.__module__}:{kind.__qualname__}"
+    return next((n for n, e in component_entries().items() if e.value == value), kind.__name__)
