@@ -36,8 +36,11 @@ class Arrow:
 
     @property
     def label(self) -> str:
-        """Ports on the way: named once where both ends agree."""
-        return ", ".join(self.labels)
+        """Ports on the way, named once where both ends agree, and why the arrow runs back."""
+        text = ", ".join(self.labels)
+        if self.back and "delay" not in text:
+            text += ", read at the start of the step"
+        return text
 
 
 def _label(connection: Connection) -> str:
@@ -79,10 +82,8 @@ def mermaid(system: System) -> str:
         lines.append(f'    {names[path]}["<b>{name}</b><br/>{kind}<br/>{rate}"]')
     shapes = {"signal": "-->", "message": "-.->", "shared": "==>"}
     for arrow in arrows(plan.flat):
-        label = f"{arrow.label} (start of step)" if arrow.back else arrow.label
-        lines.append(
-            f'    {names[arrow.source]} {shapes[arrow.kind]}|"{label}"| {names[arrow.target]}'
-        )
+        link = f'{shapes[arrow.kind]}|"{arrow.label}"|'
+        lines.append(f"    {names[arrow.source]} {link} {names[arrow.target]}")
     return "\n".join(lines) + "\n"
 
 
@@ -288,9 +289,7 @@ def _draw_back(axes: Any, boxes: dict[Any, _Box], number: int, arrow: Arrow, lan
     vertices = [(x0, y0), (x0 + aside, y0), (x0 + aside, lane)]
     vertices += [(x1 - aside, lane), (x1 - aside, y1), (x1, y1)]
     _stroke(axes, Curve(vertices, [Curve.MOVETO, *[Curve.LINETO] * 5]), arrow)
-    delayed = "delay" in arrow.label
-    label = arrow.label if delayed else f"{arrow.label}, read at the start of the step"
-    _write(axes, (x0 + x1) / 2, lane, label, arrow, "center")
+    _write(axes, (x0 + x1) / 2, lane, arrow.label, arrow, "center")
 
 
 def _write(axes: Any, x: float, y: float, text: str, arrow: Arrow, align: str) -> None:

@@ -299,7 +299,8 @@ def _messages(dataset: xarray.Dataset) -> set[str]:
     """Paths of recorded messages: what has both a value and a time of validity."""
     names = [str(n) for n in dataset.data_vars]
     stamps = {n.removesuffix(".t") for n in names if n.endswith(".t")}
-    return {s for s in stamps if any(n == s or n.startswith(f"{s}.") for n in names)}
+    values = [n for n in names if not n.endswith(".t")]
+    return {s for s in stamps if any(n == s or n.startswith(f"{s}.") for n in values)}
 
 
 def _signal_figure(dataset: xarray.Dataset, names: list[str]) -> Any:
