@@ -254,7 +254,7 @@ def _limit(ax: Any, times: FloatArray, bounds: list[FloatArray]) -> None:
         ax.text(
             0.98,
             0.95,
-            f"up to {float(f"{peak:.2g}"):g} at t = {times[int(np.nanargmax(envelope))]:g} s",
+            f"up to {float(np.format_float_positional(peak, 2, fractional=False)):g} at t = {times[int(np.nanargmax(envelope))]:g} s",
             transform=ax.transAxes,
             ha="right",
             va="top",
