@@ -251,10 +251,11 @@ def _limit(ax: Any, times: FloatArray, bounds: list[FloatArray]) -> None:
     limit = peak if peak < LATE * settled or settled == 0.0 else settled
     ax.set_ylim(-1.08 * limit, 1.08 * limit)
     if limit < peak:
+        rounded = np.format_float_positional(peak, 2, fractional=False, trim="-")
         ax.text(
             0.98,
             0.95,
-            f"up to {float(np.format_float_positional(peak, 2, fractional=False)):g} at t = {times[int(np.nanargmax(envelope))]:g} s",
+            f"up to {rounded} at t = {times[int(np.nanargmax(envelope))]:g} s",
             transform=ax.transAxes,
             ha="right",
             va="top",
