@@ -1,5 +1,6 @@
 """What the tests of the models share: a nominal pass of the radar satellite, data, derivatives."""
 
+import importlib.util
 import os
 from pathlib import Path
 
@@ -72,3 +73,12 @@ def data_folder():
     if not folder.is_dir():
         pytest.skip(f"no real data: {folder} is absent (set TERRAFIX_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def points():
+    """Echo of point targets, and radars to see them with (the module beside this one)."""
+    spec = importlib.util.spec_from_file_location("points", Path(__file__).with_name("points.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
