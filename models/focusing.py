@@ -283,7 +283,8 @@ def _compressed(
     slant_range = domain.slant_range * _range_scale(domain, velocity)
     center = float(slant_range[domain.columns].mean())
     middle = float(np.clip(domain.centroid, *frame))
-    shift = -round(center * float(_lag(np.array(middle), velocity, radar)) * radar.prf) / radar.prf
+    # rows follow the scene: a point stays at its place in the grid whatever the velocity
+    shift = -center * float(_lag(np.array(middle), velocity, radar))
     d = migration_factor(f, velocity, radar.wavelength)
     weights = get_window(window, len(rows), fftbins=False).astype(np.float32)
     data = np.zeros_like(domain.spectrum)
