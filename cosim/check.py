@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from terrafix.cosim.clock import Rate, base_step, text_seconds
+from terrafix.cosim.component import Component
 from terrafix.cosim.errors import (
     ConfigurationError,
     RateError,
@@ -84,24 +85,7 @@ def check(system: System, *, duration: Fraction | None = None) -> Plan:
             )
         )
     for path, component in flat.components.items():
-        missing = component.missing_settings()
-        refused = any(value is None for value in component._base.values())  # and reported
-        for name in missing:
-            kind = component.settings()[name].kind()
-            problems.append(
-                ConfigurationError(f"'{path}' needs a value for '{name}': it takes {kind}")
-            )
-        if component.rate is None:
-            problems.append(
-                RateError(f'\'{path}\' has no rate\n  give it a period ("0.01 s") or hz ("100 Hz")')
-            )
-        if not missing and not refused:
-            attempt(component.validate)
-            if duration is not None:
-                attempt(lambda c=component: c.validate_duration(float(duration)))  # type: ignore[misc]
-        for port in component.ports.values():
-            for field in port.fields.values():
-                attempt(lambda f=field: _check_units(f))  # type: ignore[misc]
+        problems.extend(_component_problems(path, component, duration))
     problems.extend(_unconnected(flat))
     problems.extend(_two_drivers(flat))
     base, grid = _steps(flat)
@@ -120,6 +104,34 @@ def check(system: System, *, duration: Fraction | None = None) -> Plan:
     if problems:
         raise SystemCheckError(system.name, problems)
     return Plan(flat, order, base, grid, list(_notes(flat)))
+
+
+def _component_problems(
+    path: str, component: Component, duration: Fraction | None
+) -> Iterator[TerrafixError]:
+    missing = component.missing_settings()
+    refused = any(value is None for value in component._base.values())  # and reported
+    for name in missing:
+        kind = component.settings()[name].kind()
+        yield ConfigurationError(f"'{path}' needs a value for '{name}': it takes {kind}")
+    if component.rate is None:
+        yield RateError(f'\'{path}\' has no rate\n  give it a period ("0.01 s") or hz ("100 Hz")')
+    elif component.rate.last > 0 and type(component)._step_impl is Component._step_impl:
+        yield ConfigurationError(
+            f"'{path}' cannot step: {type(component).__name__} must provide _step_impl(t, dt)"
+        )
+    actions: list[Callable[[], None]] = []
+    if not missing and not refused:
+        actions.append(component.validate)
+        if duration is not None:
+            actions.append(lambda: component.validate_duration(float(duration)))
+    for port in component.ports.values():
+        actions += [lambda f=field: _check_units(f) for field in port.fields.values()]  # type: ignore[misc]
+    for action in actions:
+        try:
+            action()
+        except TerrafixError as error:
+            yield error
 
 
 def _check_units(field: Field) -> None:

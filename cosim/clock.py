@@ -196,6 +196,11 @@ class Rate:
         return self.times[0] == 0 if self.times else self.offset == 0
 
     @property
+    def last(self) -> float:
+        """Time of the last activation [s]; infinity for a period."""
+        return math.inf if self.times is None else float(self.times[-1])
+
+    @property
     def exact_numbers(self) -> tuple[Fraction, ...]:
         """The numbers that the base step must divide. Listed times are snapped instead."""
         return () if self.period is None else (self.period, self.offset)

@@ -207,7 +207,7 @@ def range_doppler(
     # the scene lies nearer than its echo by the migration at the centroid, in whole cells
     spacing = radar.range_spacing
     n_shift = round(near_range * (1 - d_center) / spacing)
-    slant_range = near_range + spacing * (np.arange(n_cells) - n_shift)
+    slant_range = np.asarray(near_range + spacing * (np.arange(n_cells) - n_shift), np.float64)
     reference = near_range * d_center + spacing * (n_cells - radar.n_pulse) / 2
     f_r = fft.fftfreq(n_fft, 1 / radar.sample_rate)
     transverse = (SPEED_OF_LIGHT * frequency / (2 * velocity)) ** 2

@@ -305,3 +305,15 @@ def test_members_are_different_whole_numbers(toys):
     for members in (0, -1, True, [], [1, 1], [-1], [0.5], [2**32]):
         with pytest.raises(ConfigurationError, match="members"):
             Simulation(system, members=members)
+
+
+def test_a_component_without_a_step_is_refused_before_the_run():
+    class Idle(Component):
+        default_rate = Rate("1")
+
+    system = System("test")
+    system.add(Idle(), "idle")
+    with pytest.raises(
+        SystemCheckError, match=r"'idle' cannot step: Idle must provide _step_impl\(t, dt\)"
+    ):
+        check(system)
