@@ -21,6 +21,10 @@ Mask = NDArray[np.bool_]
 Saved = dict[str, Any]
 
 
+UNWRITTEN = np.uint64(0x7FF8_0000_0000_7E44)
+"""Bits of a NaN that no computation gives: stands where nothing was published."""
+
+
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
     """Return a view that cannot be written."""
     view = array.view()
@@ -44,12 +48,21 @@ class SignalSlot:
         width = sum(f.size for f in fields.values())
         empty = np.nan if dtype.kind in "fc" else 0
         self.data: NDArray[Any] = np.full((n_members, width), empty, dtype=dtype)
+        if dtype == np.float64:
+            self.data.view(np.uint64)[...] = UNWRITTEN
         self.views: dict[str, NDArray[Any]] = {}
         start = 0
         for name, each in fields.items():
             columns = self.data[:, start : start + each.size]
             self.views[name] = _strided(columns, each.fixed_shape)
             start += each.size
+
+    @property
+    def never_written(self) -> bool:
+        """Whether nothing was published here yet (known of float64 alone)."""
+        if self.data.dtype != np.float64 or not self.data.size:
+            return False
+        return bool((self.data.view(np.uint64) == UNWRITTEN).all())
 
     def get_state(self) -> Saved:
         """Arrays that reproduce the slot."""

@@ -37,6 +37,8 @@ _NUMBER = re.compile(
 def _decimal_hint(value: float) -> str:
     near = Fraction(value).limit_denominator(100_000)
     text = f"{value:.12g}"
+    if near == 0:
+        return f'write "{text}" (exact)'
     if near.denominator == 1:
         return f'write {near.numerator} or "{near.numerator}"'
     return f'write "{text}" (exact) or "{near.numerator}/{near.denominator}"'
@@ -69,6 +71,11 @@ def _exact(value: object, what: str, units: dict[str, int | Fraction], kind: str
             number = match[1]
             if number.endswith("/0") or re.search(r"/0+\Z", number):
                 raise RateError(f"{what} is '{value}': division by zero")
+            exponent = re.search(r"[eE]([+-]?\d+)\Z", number)
+            if exponent and abs(int(exponent[1])) > 18:
+                raise RateError(
+                    f"{what} is '{value}', which no simulation can count\n  give {kind}"
+                )
             return Fraction(number) * scale
         accepted = ", ".join(u for u in units if u)
         raise RateError(

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafix.cosim.clock import Rate
-from terrafix.cosim.errors import ConfigurationError, WiringError, nearest
+from terrafix.cosim.errors import ConfigurationError, RateError, WiringError, nearest
 from terrafix.cosim.noise import NormalBlocks, NormalStream
 from terrafix.cosim.parameters import Parameter, Setting
 from terrafix.cosim.ports import Capabilities, Declaration, Port, State
@@ -119,6 +119,11 @@ class Component:
     def __init__(self, *, rate: Rate | None = None, **settings: Any) -> None:
         self.name = ""
         self.rate = rate or self.default_rate
+        if self.rate is not None and not isinstance(self.rate, Rate):
+            raise RateError(
+                f"the rate of a {type(self).__name__} is {self.rate!r}\n"
+                '  write Rate("0.01") for a period, or Rate(hz=100)'
+            )
         self.ports: dict[str, Port[Any]] = {}
         self._views: dict[str, Any] = {}
         self._states: dict[str, NDArray[Any]] = {}
@@ -286,10 +291,13 @@ class Component:
         """Standard normal numbers of this step, shape (n_members, n).
 
         They depend on the root seed, the member, this component's path, the stream's name and
-        the number of this component's step, and on nothing else.
+        the number of this component's step, and on nothing else: asked twice in a step, a stream
+        gives the same numbers twice.
         """
         source = self._streams.get((stream, n))
         if source is None:
+            if n < 1:
+                raise ValueError(f"stream '{stream}' was asked for {n} numbers")
             env = self.environment
             numbers = NormalStream(env.seed, env.path, stream, env.members)
             source = self._streams[stream, n] = NormalBlocks(numbers, n)

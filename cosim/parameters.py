@@ -187,7 +187,8 @@ class Parameter(Setting[FloatArray]):
                 f"{where} is given in {unit}; it takes {self.kind()}\n"
                 f"  the units differ: {unit} is not {self.unit}"
             )
-        return array * factor
+        with np.errstate(over="ignore"):  # infinity is refused below
+            return array * factor
 
     def _wanted(self) -> str:
         """What is accepted, and how it is written."""

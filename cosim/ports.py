@@ -146,6 +146,8 @@ class Port(Declaration, Generic[View]):
         window: bool = False,
         optional: bool = False,
     ) -> None:
+        if isinstance(shape, int) or any(n is not None and n < 1 for n in shape):
+            raise ConfigurationError(f"shape is {shape}; it is a tuple of sizes, such as (3,)")
         if fields is None:
             one = Field(tuple(shape), unit, frame, dtype, ragged, tuple(labels), doc)
             self.fields: dict[str, Field] = {"": one}
@@ -216,7 +218,20 @@ class Output(Port[FloatArray]):
     """A signal that is published; assigning copies into the published array."""
 
     def __set__(self, obj: object, value: object) -> None:
-        obj._views[self.name][...] = value  # type: ignore[attr-defined]
+        array = obj._views[self.name]  # type: ignore[attr-defined]
+        try:
+            array[...] = value
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"output '{self.name}' takes {array.dtype} of shape {array.shape}, members first, "
+                f"not {_described(value)}"
+            ) from error
+
+
+def _described(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} of shape {value.shape}"
+    return f"{value!r}"[:60]
 
 
 class BundleInput(Port["BundleView"]):

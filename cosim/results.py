@@ -153,9 +153,12 @@ def write_netcdf(dataset: xarray.Dataset, path: Path) -> None:
     try:
         dataset.to_netcdf(partial, engine="netcdf4", format="NETCDF4")
         partial.replace(path)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # the library reports a full disk as the latter
         partial.unlink(missing_ok=True)
-        raise ConfigurationError(f"cannot write '{path}': {error.strerror or error}") from error
+        cause = getattr(error, "strerror", None) or str(error)
+        raise ConfigurationError(
+            f"cannot write '{path}': {cause}\n  choose another place, or make room"
+        ) from error
 
 
 def read_result(path: str | Path) -> xarray.Dataset:

@@ -6,7 +6,6 @@ print(result.evaluation["position"]["sigma_sample"])
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,10 +22,11 @@ from terrafix.cosim.errors import (
     StepError,
 )
 from terrafix.cosim.simulation import Progress, Result, Simulation
-from terrafix.cosim.storage import checkpoint_path, records_folder, rescue, writable
+from terrafix.cosim.storage import Places, writable
 from terrafix.cosim.system import System
 
 SLICES = 400  # progress reports per run
+MAX_TICKS = 10**12  # days of computing at the master's own pace, whatever the components do
 
 
 class RunError(StepError):
@@ -78,47 +78,86 @@ def simulate(
     RunError
         If a component fails; what was recorded is written and in ``error.result``.
     """
+    if not isinstance(system, System):
+        raise ConfigurationError(
+            f"simulate takes a System, not {type(system).__name__}\n"
+            "  read a file with terrafix.cosim.files.read_system"
+        )
     length = _duration(system, duration)
     out = None if out is None else writable(Path(out))
-    if resume is not None and checkpoint is not None and Path(checkpoint) != Path(resume):
+    every = None if checkpoint_every is None else seconds(checkpoint_every, "checkpoint interval")
+    if every is not None and every <= 0:
+        raise RateError(f"checkpoint interval is {text_seconds(every)} s; it must be positive")
+    saved = None if resume is None else read_checkpoint(Path(resume))
+    places = _places(system, out, checkpoint, resume, saved, checkpointing=every is not None)
+    simulation = Simulation(
+        system, members=members, seed=seed, duration=length, folder=places.folder, progress=progress
+    )
+    keep = True
+    try:
+        if saved is not None:
+            simulation.check_identity(saved)
+        _refuse_impossible(simulation, length, saved, every)
+        places.occupy(resumed=saved is not None)
+        result = _run(simulation, places, saved, length, every, progress)
+        keep = False
+        return result
+    except RunError as error:
+        # records are needed to resume, or if the result could not be written
+        keep = simulation.checkpoint is not None or error.result.out is None
+        raise
+    finally:
+        places.leave(keep=keep)
+        simulation.master.terminate()
+
+
+def _places(
+    system: System,
+    out: Path | None,
+    checkpoint: str | Path | None,
+    resume: str | Path | None,
+    saved: dict[str, Any] | None,
+    *,
+    checkpointing: bool,
+) -> Places:
+    if resume is None or saved is None:
+        target = None if checkpoint is None else Path(checkpoint)
+        return Places.of_run(system.name, out=out, checkpoint=target, checkpointing=checkpointing)
+    if checkpoint is not None and Path(checkpoint) != Path(resume):
         raise ConfigurationError(
             f"a run resumed from '{resume}' keeps its checkpoints there, not in '{checkpoint}': "
             "its records are beside it\n  give no other checkpoint"
         )
-    saved = None if resume is None else read_checkpoint(Path(resume))
-    every = None if checkpoint_every is None else seconds(checkpoint_every, "checkpoint interval")
-    if every is not None and every <= 0:
-        raise RateError(f"checkpoint interval is {text_seconds(every)} s; it must be positive")
-    target = checkpoint_path(system.name, checkpoint or resume, out)
-    folder = records_folder(out, target if every is not None or saved is not None else None)
-    simulation = Simulation(
-        system, members=members, seed=seed, duration=length, folder=folder, progress=progress
-    )
+    return Places.of_resumed(Path(resume), saved, out=out)
+
+
+def _run(
+    simulation: Simulation,
+    places: Places,
+    saved: dict[str, Any] | None,
+    length: Fraction,
+    every: Fraction | None,
+    progress: Progress | None,
+) -> Result:
+    started = time.perf_counter()
     try:
-        _refuse_impossible(simulation, length, saved, every)
-        if folder is not None and saved is None:
-            rescue(folder)
-        started = time.perf_counter()
-        try:
-            if saved is not None:
-                simulation.set_state(saved)
-                simulation.checkpoint = target
-            else:
-                simulation.initialize()
-            _fly(simulation, length, every, target, progress)
-        except (StepError, KeyboardInterrupt) as error:
-            result = _finish(simulation, started, _status(error), out)
-            with suppress(StepError):  # the first failure is the one to report
-                simulation.master.terminate()
-            raise RunError(_kept(error, result, simulation.checkpoint), result) from error
-        result = _finish(simulation, started, "complete", out)
-        try:
+        if saved is not None:
+            simulation.set_state(saved)
+            simulation.checkpoint = places.checkpoint
+        else:
+            simulation.initialize()
+        _fly(simulation, length, every, places, progress)
+    except (StepError, KeyboardInterrupt) as error:
+        result = _finish(simulation, started, _status(error), places)
+        with suppress(StepError):  # the first failure is the one to report
             simulation.master.terminate()
-        except StepError as error:
-            raise RunError(_kept(error, result, None), result) from error
-        return result
-    finally:
+        raise RunError(_kept(error, result, simulation.checkpoint), result) from error
+    result = _finish(simulation, started, "complete", places)
+    try:
         simulation.master.terminate()
+    except StepError as error:
+        raise RunError(_kept(error, result, None), result) from error
+    return result
 
 
 def _refuse_impossible(
@@ -130,6 +169,12 @@ def _refuse_impossible(
         raise RateError(
             f"duration is {text_seconds(length)} s, shorter than the base step of "
             f"{text_seconds(base)} s\n  give a longer one"
+        )
+    if master.ticks(length) > MAX_TICKS:
+        raise RateError(
+            f"duration is {text_seconds(length)} s at a base step of {text_seconds(base)} s: "
+            f"{master.ticks(length):.3g} ticks, more than {MAX_TICKS:.0e}\n"
+            "  fly shorter, or look for a period that makes the base step so fine"
         )
     if saved is not None and saved["master"]["tick"] > master.ticks(length):
         raise CheckpointError(
@@ -150,7 +195,7 @@ def _fly(
     simulation: Simulation,
     length: Fraction,
     every: Fraction | None,
-    target: Path,
+    places: Places,
     progress: Progress | None,
 ) -> None:
     master = simulation.master
@@ -162,23 +207,29 @@ def _fly(
     for stop in sorted({s for s in stops | saves if master.tick < s < end} | {end}):
         master.run_until(stop)
         if stop in saves:
-            write_checkpoint(target, simulation.get_state())
-            simulation.checkpoint = target
+            state = simulation.get_state() | {"places": places.described()}
+            write_checkpoint(places.checkpoint, state)
+            simulation.checkpoint = places.checkpoint
         if progress is not None:
             progress("running", stop / end)
 
 
-def _finish(simulation: Simulation, started: float, status: str, out: Path | None) -> Result:
+def _finish(simulation: Simulation, started: float, status: str, places: Places) -> Result:
     from terrafix.cosim.results import write_netcdf
 
     wall = time.perf_counter() - started
     result = simulation.result(wall_s=wall, status=status)
-    if out is not None:
-        write_netcdf(result.dataset, out)
-        result.out = out
-    superfluous = status == "complete" or (out is not None and simulation.checkpoint is None)
-    if simulation.folder is not None and superfluous:
-        shutil.rmtree(simulation.folder, ignore_errors=True)
+    result.notes = places.notes + result.notes
+    target = places.result_file(complete=status == "complete")
+    if target is not None:
+        try:
+            write_netcdf(result.dataset, target)
+        except ConfigurationError as error:
+            what = "the run is complete" if status == "complete" else f"the run {status}"
+            raise RunError(
+                f"{what}, but {error}\n  its records are kept in '{places.folder}'", result
+            ) from error
+        result.out = target
     return result
 
 

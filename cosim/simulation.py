@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -74,13 +75,14 @@ class Result:
     dataset: xarray.Dataset
     status: str = "complete"
     overruns: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
     out: Path | None = None
 
     def summary(self) -> dict[str, Any]:
         """Plain types for JSON."""
         names = (
             "system seed members excluded ticks component_steps wall_s setup_s kernel "
-            "evaluation status overruns"
+            "evaluation status overruns notes"
         )
         return {n: getattr(self, n) for n in names.split()}
 
@@ -127,6 +129,9 @@ class Simulation:
         self.plan: Plan = check(system, duration=length)
         self.members = _member_numbers(system.members if members is None else members)
         self.seed = system.seed if seed is None else seed
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise ConfigurationError(f"seed is {self.seed!r}; it is a whole number from 0 on")
+        _refuse_too_large(self.plan, len(self.members))
         self.folder = folder
         self.checkpoint: Path | None = None
         try:
@@ -240,22 +245,20 @@ class Simulation:
         CheckpointError
             If it belongs to another system, seed or ensemble; the difference is named.
         """
-        mine, theirs = self._identity(), saved["identity"]
-        differing = [k for k in mine if mine[k] != theirs.get(k)]
-        if differing:
-            key = differing[0]
-            raise CheckpointError(difference(key, mine[key], theirs.get(key)))
-        if self.folder is not None and not self.folder.is_dir():
-            raise CheckpointError(
-                f"the records that belong to the checkpoint are gone: there is no folder "
-                f"'{self.folder}'\n"
-                "  a run that has ended keeps them in its result; start again without --resume"
-            )
+        self.check_identity(saved)
         if not self.initialized:
             self._initialize(observe=False)
         self.master.set_state(saved["master"])
         for recorder in self.recorders:
             recorder.set_state(saved["recorders"][recorder.name])
+
+    def check_identity(self, saved: dict[str, Any]) -> None:
+        """Raise CheckpointError if a saved state belongs to another system, seed or ensemble."""
+        mine, theirs = self._identity(), saved["identity"]
+        differing = [k for k in mine if mine[k] != theirs.get(k)]
+        if differing:
+            key = differing[0]
+            raise CheckpointError(difference(key, mine[key], theirs.get(key)))
 
     def _identity(self) -> dict[str, Any]:
         return {
@@ -285,6 +288,15 @@ class Simulation:
             "cpu": cpu_name(),
             "configuration": self.configuration,
         }
+
+    def _notes(self) -> list[str]:
+        """What a person should know although nothing failed."""
+        silent = [
+            path
+            for path, slot in self.master.wiring.slots.items()
+            if isinstance(slot, SignalSlot) and slot.never_written
+        ]
+        return [f"output '{path}' was never published" for path in silent]
 
     def evaluate(self) -> dict[str, Any]:
         """What evaluation components publish, from what was recorded so far."""
@@ -326,12 +338,34 @@ class Simulation:
             dataset=dataset,
             status=status,
             overruns={path: r.overruns for path, r in readers.items() if r.overruns},
+            notes=self._notes(),
+        )
+
+
+def _refuse_too_large(plan: Plan, n_members: int) -> None:
+    """Raise ConfigurationError if the ports alone would not fit into this machine's memory."""
+    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
+        return
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    one = sum(
+        f.size * np.dtype(f.dtype).itemsize
+        for c in plan.flat.components.values()
+        for p in c.ports.values()
+        for f in p.fields.values()
+        if p.kind != "shared"
+    )
+    if n_members * one > 0.8 * memory:
+        raise ConfigurationError(
+            f"{n_members} members need more than {n_members * one / 2**30:.0f} GiB for their ports "
+            f"alone; this machine has {memory / 2**30:.0f} GiB\n  fly fewer at a time"
         )
 
 
 def _member_numbers(members: int | Sequence[int]) -> NDArray[np.int64]:
     if isinstance(members, bool) or (isinstance(members, int) and members < 1):
         raise ConfigurationError(f"members is {members}; an ensemble has at least 1")
+    if isinstance(members, int) and members > MAX_MEMBER:
+        raise ConfigurationError(f"members is {members}; there are at most {MAX_MEMBER}")
     numbers = np.arange(members) if isinstance(members, int) else np.asarray(members)
     if (
         numbers.ndim != 1

@@ -138,6 +138,9 @@ class System:
             If the name is no identifier or is taken, or the node belongs to a system already.
         """
         _checked_name(name, "component")
+        if not isinstance(node, Component | System):
+            what = f"the class {node.__name__}" if isinstance(node, type) else repr(node)
+            raise ConfigurationError(f"cannot add {what} as '{name}': make a component of it first")
         if name in TABLES:
             raise ConfigurationError(
                 f"'{name}' cannot name a component: it is a table of system files"
@@ -225,7 +228,7 @@ class System:
     def record(
         self,
         name: str,
-        ports: Sequence[PortRef | str],
+        ports: PortRef | str | Sequence[PortRef | str],
         *,
         period: Exact | None = None,
         rate: Rate | None = None,
@@ -236,7 +239,8 @@ class System:
             raise ConfigurationError(f"system '{self.name}' has a record '{name}' already")
         if period is not None:
             rate = Rate(period)
-        paths = tuple(self._path(p) for p in ports)
+        listed = [ports] if isinstance(ports, PortRef | str) else ports
+        paths = tuple(self._path(p) for p in listed)
         if not paths:
             raise ConfigurationError(f"record '{name}' names no ports")
         self.records.append(Record(name, paths, rate))
@@ -309,6 +313,10 @@ class System:
     def _path(self, port: PortRef | str) -> str:
         if isinstance(port, str):
             return port
+        if not isinstance(port, PortRef):
+            raise WiringError(
+                f'{type(port).__name__} is no port\n  name one of its ports: part["port"]'
+            )
         for name, node in self.nodes.items():
             if node is port.component:
                 return f"{name}.{port.port}"

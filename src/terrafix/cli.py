@@ -141,20 +141,22 @@ def _target(option: str, text: str | None, suffixes: tuple[str, ...]) -> Path | 
     """The file an option names, refused now if it could not be written later."""
     if text is None:
         return None
+    if not text.strip():
+        raise ConfigurationError(f"{option} names no file\n  name one, or leave {option} out")
     path = Path(text)
     if path.suffix.lower() not in suffixes:
         raise ConfigurationError(
             f"{option} '{text}' is no {' or '.join(suffixes)} file\n"
             f"  its ending says what is written: name it '{path.with_suffix(suffixes[0]).name}'"
         )
-    if path.is_dir():
-        raise ConfigurationError(f"{option} '{text}' is a folder; name a file in it")
-    if not path.parent.is_dir():
-        raise ConfigurationError(
-            f"cannot write {option} '{text}': there is no folder '{path.parent}'"
-        )
     probe = path.with_name(f".{path.name}.{os.getpid()}.probe")
     try:
+        if path.is_dir():
+            raise ConfigurationError(f"{option} '{text}' is a folder; name a file in it")
+        if not path.parent.is_dir():
+            raise ConfigurationError(
+                f"cannot write {option} '{text}': there is no folder '{path.parent}'"
+            )
         probe.touch()
         probe.unlink()
     except OSError as error:
@@ -260,6 +262,8 @@ def run(
 
         _show(*result_tables(result))
     if not quiet:
+        for note in result.notes:
+            print(f"note: {note}", file=sys.stderr)
         written = [result.out] if result.out else []
         for path in [*written, figure] if drawn else written:
             print(f"wrote {path}", file=sys.stderr)

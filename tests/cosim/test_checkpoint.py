@@ -242,7 +242,7 @@ def test_another_run_is_refused_by_name(toys, interrupted, change, options, text
         made.record("more", ["walk.x"])
     with pytest.raises(CheckpointError, match=text):
         simulate(made, resume=interrupted, **options)
-    assert interrupted.with_name("run.ckpt.parts").is_dir()
+    assert interrupted.with_name("run.nc.parts").is_dir()
     made.nodes["walk"].start = 1.0  # nothing stays bound after a refusal
     simulate(system(toys), resume=interrupted)
 
@@ -250,7 +250,7 @@ def test_another_run_is_refused_by_name(toys, interrupted, change, options, text
 def test_checkpoint_and_records_belong_together(toys, interrupted, tmp_path):
     with pytest.raises(Exception, match="keeps its checkpoints there, not in"):
         simulate(system(toys), resume=interrupted, checkpoint=tmp_path / "other.ckpt")
-    parts = interrupted.with_name("run.ckpt.parts")
+    parts = interrupted.with_name("run.nc.parts")
     chunk = min(parts.glob("walk_x.*.npz"))
     chunk.rename(tmp_path / "elsewhere")
     with pytest.raises(
