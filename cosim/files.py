@@ -292,7 +292,7 @@ def _rate(timing: Mapping[str, Any], where: str) -> Rate | None:
         options["hz"] = options.pop("rate")
     times = options.get("times")
     if isinstance(times, str):
-        options["times"] = [t for t in re.split(r"[\s,\[\]\"']+", times) if t]
+        options["times"] = [t for t in re.split(r"[,\[\]\"']+", times) if t.strip()]
     elif times is not None and not isinstance(times, list):
         raise RateError(f'{where}: times is {shown(times)}; write a list, ["0 s", "10 s"]')
     try:
