@@ -16,11 +16,11 @@ demo: $(RUN)
 
 ## all tests, with lint and types
 test: $(STAMP) lint types
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 ## tests alone
 quick: $(STAMP)
-	$(BIN)/python -m pytest -q -n 2 -x
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -x
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
