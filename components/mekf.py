@@ -19,6 +19,7 @@ from terrafix.models.earth import EARTH
 from terrafix.models.gravity import GRAVITY_MODELS
 from terrafix.models.mekf import TRANSITIONS, mekf_correct_model, mekf_predict_model
 from terrafix.models.model import Model
+from terrafix.models.sar import IN_TRACK
 from terrafix.models.updates import UPDATES
 
 
@@ -62,6 +63,11 @@ class MekfCorrect(SymbolicComponent):
     default_rate = Rate("8.2", offset="8.2")
 
     update = Choice(UPDATES, "ekf", doc="how the measurement is weighed")
+    in_track = Choice(
+        IN_TRACK,
+        "speed",
+        doc="what the fix's fourth element is: the speed, or the velocity that focused an image",
+    )
     look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     underweighting = Parameter(0.2, minimum=0.0, doc="Lear's factor on H P H'")
@@ -82,5 +88,5 @@ class MekfCorrect(SymbolicComponent):
     innovation = MessageOutput(fields=INNOVATION, doc="what became of the fix")
 
     def build_model(self) -> Model:
-        """Build the model for the chosen update."""
-        return mekf_correct_model(self.update)
+        """Build the model for the chosen update and measurement."""
+        return mekf_correct_model(self.update, self.in_track)

@@ -9,7 +9,7 @@ from terrafix.cosim.ports import Input, MessageOutput, Output
 from terrafix.cosim.symbolic import SymbolicComponent
 from terrafix.models.earth import EARTH
 from terrafix.models.model import Model
-from terrafix.models.sar import BORESIGHTS, antenna_mount_model, synthetic_fix_model
+from terrafix.models.sar import BORESIGHTS, IN_TRACK, antenna_mount_model, synthetic_fix_model
 
 
 class AntennaMount(SymbolicComponent):
@@ -17,6 +17,7 @@ class AntennaMount(SymbolicComponent):
 
     default_rate = Rate(hz=100)
 
+    misalignment = Parameter(0.0, shape=(3,), unit="rad", doc="mean at t = 0, rotation vector")
     misalignment_sigma0 = Parameter(0.0, unit="rad", minimum=0.0, doc="drawn at t = 0, per axis")
     misalignment_walk = Parameter(0.0, unit="rad/s^0.5", minimum=0.0, doc="random walk, per axis")
 
@@ -40,6 +41,7 @@ class SyntheticSarFix(SymbolicComponent):
         "true",
         doc="nominal: pixel where the misaligned antenna does not look (control)",
     )
+    in_track = Choice(IN_TRACK, "speed", doc="what the fourth element is, as in mekf_correct")
     look = Parameter(unit="rad", doc="off-nadir angle of the boresight, to the right")
     squint = Parameter(0.0, unit="rad", doc="forward angle of the boresight")
     range_sigma = Parameter(1.0, unit="m", minimum=0.0, doc="noise of the slant range")
@@ -60,5 +62,5 @@ class SyntheticSarFix(SymbolicComponent):
     fix = MessageOutput(fields=FIX, doc="the fix")
 
     def build_model(self) -> Model:
-        """Build the model for the chosen boresight."""
-        return synthetic_fix_model(self.boresight)
+        """Build the model for the chosen boresight and measurement."""
+        return synthetic_fix_model(self.boresight, self.in_track)

@@ -212,7 +212,7 @@ def _propagated(P: Any, phi: Any, accel_psd: Any, misalignment_psd: Any, dt: Any
     return mirrored(ca.blockcat([[state, moved[:, 6:]], [moved[:, 6:].T, mount]]))
 
 
-def mekf_correct_model(update: str = "ekf") -> Model:
+def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
     r"""Correction of the prior by a fix: update, underweighting, gate.
 
     The reported position of the pixel has covariance D; it enters the innovation as
@@ -224,6 +224,8 @@ def mekf_correct_model(update: str = "ekf") -> Model:
     update : {"ekf", "iterated", "unscented"}
         How the measurement is weighed. The paper's update leaves the covariance centered on the
         prior misalignment, an error of second order; the other two center it on the estimate.
+    in_track : {"speed", "effective"}
+        What the fix's fourth element is: see `terrafix.models.sar`.
 
     Returns
     -------
@@ -244,7 +246,7 @@ def mekf_correct_model(update: str = "ekf") -> Model:
     Raises
     ------
     ValueError
-        If `update` is not a known choice.
+        If a choice is not known.
     """
     rule = update_rule(update)
     prior = estimate_symbols("prior")
@@ -266,7 +268,7 @@ def mekf_correct_model(update: str = "ekf") -> Model:
     beta = ca.if_else(n_updates <= underweighted_updates, underweighting, 0.0)
     arrived = fresh > 0.5
     fix["present"] = ca.if_else(arrived, fix["present"], 0.0)
-    outcome = rule(mirrored(prior["P"]), _measurement(prior, fix, q_be, q_sb), beta)
+    outcome = rule(mirrored(prior["P"]), _measurement(prior, fix, q_be, q_sb, in_track), beta)
     dof = ca.sum1(fix["present"] > 0.5)
     threshold = sum(ca.if_else(dof == k + 1, gate[k], 0.0) for k in range(4))
     reason = ca.if_else(
@@ -287,7 +289,7 @@ def mekf_correct_model(update: str = "ekf") -> Model:
     }
     posterior = {k: ca.if_else(accepted, corrected[k], prior[k]) for k in prior}
     return Model(
-        f"mekf_correct_{update}",
+        f"mekf_correct_{update}_{in_track}",
         inputs=inputs,
         states={"n_updates": n_updates},
         parameters={**parameters, "gate": gate},
@@ -322,7 +324,7 @@ def _recentered(P: Any, dmu: Any) -> Any:
     return mirrored(ca.mtimes(J, ca.mtimes(P, J.T)))
 
 
-def _measurement(prior: Any, fix: Any, q_be: Any, q_sb: Any) -> Measurement:
+def _measurement(prior: Any, fix: Any, q_be: Any, q_sb: Any, in_track: str) -> Measurement:
     """Express the fix as a measurement of the error of the prior."""
     error, pixel = ca.SX.sym("error", 9), ca.SX.sym("pixel", 3)
     y = predicted_measurement(
@@ -333,6 +335,7 @@ def _measurement(prior: Any, fix: Any, q_be: Any, q_sb: Any) -> Measurement:
         q_be,
         q_sb,
         pixel,
+        in_track,
     )
     by_error, by_pixel = ca.jacobian(y, error), ca.jacobian(y, pixel)
 

@@ -11,6 +11,10 @@ so its two measured tangents are zero by construction. Predicted from an estimat
 with :math:`r_f` the pixel's position and :math:`q_\mu` the misalignment of the antenna, whose
 error rotates from the left, :math:`T(\delta\mu) \approx I - [\delta\mu \times]`.
 
+Autofocus does not measure the speed but the effective velocity
+(`terrafix.models.effective_velocity`), which depends on position too; with
+``in_track="effective"`` the fourth element is that, and its derivatives follow.
+
 Antenna axes: z along the boresight, x along the track, y across it.
 
 References
@@ -27,6 +31,8 @@ from typing import Any
 
 import casadi as ca
 
+from terrafix.models.earth import EARTH
+from terrafix.models.effective_velocity import effective_velocity
 from terrafix.models.geodesy import ellipsoid_intersection
 from terrafix.models.model import Model
 from terrafix.models.quaternion import (
@@ -39,6 +45,33 @@ from terrafix.models.quaternion import (
 
 BORESIGHTS = ("true", "nominal")
 """Which boresight the synthetic pixel lies on."""
+
+IN_TRACK = ("speed", "effective")
+"""What the fourth element is: the speed, or the effective velocity that focuses an image."""
+
+
+def in_track_velocity(r_e: Any, v_e: Any, r_f_e: Any, in_track: str) -> Any:
+    """Fourth element of the measurement [m/s].
+
+    Parameters
+    ----------
+    r_e, v_e : SX, shape (3,)
+        Position [m] and velocity [m/s] of the spacecraft, Earth-fixed.
+    r_f_e : SX, shape (3,)
+        Position of the pixel [m], Earth-fixed.
+    in_track : {"speed", "effective"}
+
+    Raises
+    ------
+    ValueError
+        If `in_track` is not a known choice.
+    """
+    if in_track == "speed":
+        return ca.sqrt(ca.dot(v_e, v_e))
+    if in_track != "effective":
+        raise ValueError(f"in_track must be one of {IN_TRACK}, got '{in_track}'")
+    constants = (EARTH.mu, EARTH.radius, EARTH.j2, EARTH.rotation_rate)
+    return effective_velocity(r_e, v_e, r_f_e, *constants)
 
 
 def nominal_antenna(look: Any, squint: Any) -> Any:
@@ -66,9 +99,16 @@ def boresight_direction(q_be: Any, q_sb: Any, q_mu: Any) -> Any:
 
 
 def predicted_measurement(
-    r_e: Any, v_e: Any, q_mu: Any, dmu: Any, q_be: Any, q_sb: Any, r_f_e: Any
+    r_e: Any,
+    v_e: Any,
+    q_mu: Any,
+    dmu: Any,
+    q_be: Any,
+    q_sb: Any,
+    r_f_e: Any,
+    in_track: str = "speed",
 ) -> Any:
-    """Measurement (4,) predicted at a state: two tangents [-], range [m], speed [m/s].
+    """Measurement (4,) predicted at a state: two tangents [-], range [m], velocity [m/s].
 
     Eqs. (18)-(22) of [1]_. Undefined where the pixel lies across the boresight.
 
@@ -84,6 +124,8 @@ def predicted_measurement(
         Earth-fixed to body, and body to nominal antenna axes.
     r_f_e : SX, shape (3,)
         Position of the pixel [m], Earth-fixed.
+    in_track : {"speed", "effective"}
+        What the fourth element is.
     """
     line_e = r_f_e - r_e
     q_se = product(q_mu, product(q_sb, q_be))
@@ -93,12 +135,17 @@ def predicted_measurement(
         line_s[0] / line_s[2],
         line_s[1] / line_s[2],
         ca.sqrt(ca.dot(line_e, line_e)),
-        ca.sqrt(ca.dot(v_e, v_e)),
+        in_track_velocity(r_e, v_e, r_f_e, in_track),
     )
 
 
-def sar_measurement_model() -> Model:
+def sar_measurement_model(in_track: str = "speed") -> Model:
     """Four-element measurement as a function of the state, its error and the pixel.
+
+    Parameters
+    ----------
+    in_track : {"speed", "effective"}
+        What the fourth element is.
 
     Returns
     -------
@@ -113,7 +160,7 @@ def sar_measurement_model() -> Model:
     return Model(
         "sar_measurement",
         inputs=inputs,
-        outputs={"y": predicted_measurement(**inputs)},
+        outputs={"y": predicted_measurement(**inputs, in_track=in_track)},
         jacobians=[("y", "r_e"), ("y", "v_e"), ("y", "dmu"), ("y", "r_f_e")],
     )
 
@@ -123,30 +170,35 @@ def antenna_mount_model() -> Model:
 
     .. math::
         q_\mu^+ = \delta q(\sigma_w \sqrt{\Delta t}\, n) \otimes q_\mu, \qquad
-        q_{\mu,0} = \delta q(\sigma_0 n)
+        q_{\mu,0} = \delta q(\mu_0 + \sigma_0 n)
 
     Returns
     -------
     Model
-        Parameters ``misalignment_sigma0`` [rad] and ``misalignment_walk`` [rad/sqrt(s)], per
-        axis; output ``q_mu`` (4,).
+        Parameters ``misalignment`` (3,) [rad], ``misalignment_sigma0`` [rad] and
+        ``misalignment_walk`` [rad/sqrt(s)], per axis; output ``q_mu`` (4,).
     """
     q_mu, noise, dt = ca.SX.sym("q_mu", 4), ca.SX.sym("misalignment_noise", 3), ca.SX.sym("dt")
     sigma0, walk = ca.SX.sym("misalignment_sigma0"), ca.SX.sym("misalignment_walk")
+    mean = ca.SX.sym("misalignment", 3)
     increment = from_small_rotation_vector(walk * ca.sqrt(dt) * noise)
     return Model(
         "antenna_mount",
         states={"q_mu": q_mu},
-        parameters={"misalignment_sigma0": sigma0, "misalignment_walk": walk},
+        parameters={
+            "misalignment": mean,
+            "misalignment_sigma0": sigma0,
+            "misalignment_walk": walk,
+        },
         noise={"misalignment_noise": noise},
         next={"q_mu": normalized(product(increment, q_mu))},
-        initial={"q_mu": from_rotation_vector(sigma0 * noise)},
+        initial={"q_mu": from_rotation_vector(mean + sigma0 * noise)},
         outputs={"q_mu": q_mu},
         step=dt,
     )
 
 
-def synthetic_fix_model(boresight: str = "true") -> Model:
+def synthetic_fix_model(boresight: str = "true", in_track: str = "speed") -> Model:
     r"""Fix without an image: where the boresight meets the ellipsoid, with given errors.
 
     The measured tangents are exactly zero. The range is that to the true pixel; the error of
@@ -157,6 +209,8 @@ def synthetic_fix_model(boresight: str = "true") -> Model:
     boresight : {"true", "nominal"}
         Whether the pixel lies on the misaligned boresight, as it does, or on the nominal one:
         a mistake that the innovations do not show, kept as a negative control.
+    in_track : {"speed", "effective"}
+        What the fourth element is.
 
     Returns
     -------
@@ -170,7 +224,7 @@ def synthetic_fix_model(boresight: str = "true") -> Model:
     Raises
     ------
     ValueError
-        If `boresight` is not a known choice.
+        If a choice is not known.
     """
     if boresight not in BORESIGHTS:
         raise ValueError(f"boresight must be one of {BORESIGHTS}, got '{boresight}'")
@@ -190,7 +244,7 @@ def synthetic_fix_model(boresight: str = "true") -> Model:
         0,
         0,
         ca.sqrt(ca.dot(line, line)) + range_sigma * range_noise,
-        ca.sqrt(ca.dot(v_e, v_e)) + speed_sigma * speed_noise,
+        in_track_velocity(r_e, v_e, r_f_e, in_track) + speed_sigma * speed_noise,
     )
     return Model(
         "synthetic_fix",

@@ -1,0 +1,209 @@
+r"""From a place in a radar image to a place on Earth, and back.
+
+A pixel is what was seen at time :math:`t` and slant range :math:`R` with Doppler frequency
+:math:`f`. On a surface of given height that is one point :math:`p` to the right of the track,
+
+.. math::
+    \lVert p - r(t) \rVert = R, \qquad
+    \frac{2\, v(t)^T (p - r(t))}{\lambda R} = f, \qquad h(p) = h,
+
+with Earth-fixed :math:`r, v`, and :math:`h(p)` the height above the ellipsoid. Terrain makes the
+last equation implicit: the height is looked up where the point is, until it stays.
+
+Broadside is :math:`f = 0`, the "zero-Doppler" coordinates of most products. In squinted images
+:math:`f` is that of the beam's center, so that :math:`t` is when the point was in fact seen.
+
+References
+----------
+.. [1] J. C. Curlander, "Location of Spaceborne SAR Imagery", IEEE Trans. Geoscience and Remote
+       Sensing GE-20(3), 1982.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from terrafix.models.arc import OrbitArc
+from terrafix.models.earth import EARTH
+from terrafix.models.model import FloatArray
+
+Height = Callable[[FloatArray, FloatArray], FloatArray]
+"""Height [m] at latitudes and longitudes [rad]."""
+
+_E2 = EARTH.flattening * (2 - EARTH.flattening)
+_STEPS = 50
+
+
+def geodetic(p: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Latitude, longitude [rad] and height [m] of points (..., 3) [m] near the ellipsoid.
+
+    Bowring's formula once: exact to a nanometer below 20 km, for many points at once;
+    `terrafix.models.geodesy` has the one for all heights.
+    """
+    x, y, z = np.moveaxis(np.asarray(p, dtype=np.float64), -1, 0)
+    out = np.hypot(x, y)
+    beta = np.arctan2(z, (1 - EARTH.flattening) * out)
+    up = z + _E2 / (1 - _E2) * EARTH.polar_radius * np.sin(beta) ** 3
+    latitude = np.arctan2(up, out - _E2 * EARTH.radius * np.cos(beta) ** 3)
+    sin, cos = np.sin(latitude), np.cos(latitude)
+    height = out * cos + z * sin - EARTH.radius * np.sqrt(1 - _E2 * sin * sin)
+    return latitude, np.arctan2(y, x), height
+
+
+def ecef(latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> FloatArray:
+    """Points (..., 3) [m], Earth-fixed, at latitudes, longitudes [rad] and heights [m]."""
+    latitude, longitude, height = np.broadcast_arrays(latitude, longitude, height)
+    sin, cos = np.sin(latitude), np.cos(latitude)
+    normal = EARTH.radius / np.sqrt(1 - _E2 * sin * sin)
+    out = (normal + height) * cos
+    up = (normal * (1 - _E2) + height) * sin
+    return np.stack([out * np.cos(longitude), out * np.sin(longitude), up], axis=-1)
+
+
+def local_axes(p: ArrayLike) -> FloatArray:
+    """Rows east, north, up of points (..., 3): shape (..., 3, 3), Earth-fixed."""
+    latitude, longitude, _ = geodetic(p)
+    (sl, cl), (so, co) = ((np.sin(a), np.cos(a)) for a in (latitude, longitude))
+    east = np.stack([-so, co, np.zeros_like(so)], axis=-1)
+    north = np.stack([-sl * co, -sl * so, cl], axis=-1)
+    up = np.stack([cl * co, cl * so, sl], axis=-1)
+    return np.stack([east, north, up], axis=-2)
+
+
+def ground_point(
+    r: ArrayLike, v: ArrayLike, slant_range: ArrayLike, sine: ArrayLike, height: ArrayLike = 0.0
+) -> FloatArray:
+    r"""Point at a height that is seen to the right at a range and a Doppler frequency.
+
+    Parameters
+    ----------
+    r, v : array_like, shape (..., 3)
+        Radar position [m] and velocity [m/s], Earth-fixed.
+    slant_range : array_like, shape (...)
+        [m]
+    sine : array_like, shape (...)
+        Sine of the angle ahead of broadside: :math:`\lambda f / (2 \lVert v \rVert)`.
+    height : array_like, shape (...)
+        Above the ellipsoid [m].
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Earth-fixed [m].
+
+    Raises
+    ------
+    ValueError
+        If a range does not reach the ground.
+    """
+    r, v = np.asarray(r, np.float64), np.asarray(v, np.float64)
+    shape = np.broadcast_shapes(r.shape[:-1], v.shape[:-1], *map(np.shape, (slant_range, sine)))
+    shape = np.broadcast_shapes(shape, np.shape(height))
+    R, s, h = (
+        np.broadcast_to(np.asarray(a, np.float64), shape) for a in (slant_range, sine, height)
+    )
+    r, v = (np.broadcast_to(a, (*shape, 3)) for a in (r, v))
+    ahead = v / np.linalg.norm(v, axis=-1, keepdims=True)
+    down = -r + ahead * np.sum(r * ahead, axis=-1, keepdims=True)
+    down /= np.linalg.norm(down, axis=-1, keepdims=True)
+    right = np.cross(down, ahead)
+    across = R * np.sqrt(1 - s * s)
+    base = r + (R * s)[..., None] * ahead
+    # rotate about the track until the height is right: Newton on the look angle
+    sphere = np.linalg.norm(base, axis=-1)
+    radius = EARTH.radius * (1 - EARTH.flattening * (base[..., 2] / sphere) ** 2) + h
+    cosine = (sphere**2 + across**2 - radius**2) / (2 * sphere * across)
+    if not np.all(np.abs(cosine) < 1):
+        raise ValueError(
+            f"a slant range of {float(R.min()):.0f} to {float(R.max()):.0f} m does not reach the ground"
+        )
+    look = np.arccos(cosine)
+    for _ in range(_STEPS):
+        cl, sl = np.cos(look)[..., None], np.sin(look)[..., None]
+        p = base + across[..., None] * (cl * down + sl * right)
+        miss = geodetic(p)[2] - h
+        if np.abs(miss).max(initial=0.0) < 1e-6:
+            return np.asarray(p)
+        climb = across * np.sum(local_axes(p)[..., 2, :] * (cl * right - sl * down), axis=-1)
+        look = look - miss / climb
+    raise ValueError("a slant range grazes the ground: its point is not defined")
+
+
+def ground_point_on_terrain(
+    r: ArrayLike,
+    v: ArrayLike,
+    slant_range: ArrayLike,
+    sine: ArrayLike,
+    terrain: Height,
+    start: ArrayLike = 0.0,
+) -> FloatArray:
+    """Point on a terrain that is seen at a range and a Doppler frequency.
+
+    Where slopes facing the radar are steeper than its view (layover) several points share a
+    pixel, and one of them is found.
+
+    Parameters
+    ----------
+    r, v, slant_range, sine
+        As in `ground_point`.
+    terrain : callable
+        Height [m] at latitudes and longitudes [rad].
+    start : array_like
+        Height to begin with [m].
+    """
+    h = np.asarray(start, dtype=np.float64)
+    for _ in range(_STEPS):
+        p = ground_point(r, v, slant_range, sine, h)
+        latitude, longitude, _ = geodetic(p)
+        found = terrain(latitude, longitude)
+        if np.abs(found - h).max(initial=0.0) < 1e-3:
+            return p
+        h = h + 0.7 * (found - h)
+    return p
+
+
+def seen_at(
+    arc: OrbitArc, p: ArrayLike, doppler: float, wavelength: float, start: ArrayLike | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Time [s] and slant range [m] at which points are seen with a Doppler frequency.
+
+    Parameters
+    ----------
+    arc : OrbitArc
+        Of the radar.
+    p : array_like, shape (..., 3)
+        Points [m], Earth-fixed.
+    doppler : float
+        Absolute Doppler frequency [Hz].
+    wavelength : float
+        [m]
+    start : array_like, optional
+        Times to begin with [s]; the middle of the arc by default.
+
+    Raises
+    ------
+    ValueError
+        If a point is not seen so within the arc.
+    """
+    p = np.asarray(p, dtype=np.float64)
+    middle = (arc.start + arc.stop) / 2
+    t = np.broadcast_to(np.asarray(middle if start is None else start, np.float64), p.shape[:-1])
+    for _ in range(_STEPS):
+        inside = np.clip(t, arc.start, arc.stop)
+        r, v, a = (arc.derivative(inside, k) for k in range(3))
+        line = p - r
+        R = np.linalg.norm(line, axis=-1)
+        closing = np.sum(v * line, axis=-1) / R
+        # d(closing)/dt = (a . line - v . v + closing^2) / R
+        rate = (np.sum(a * line, axis=-1) - np.sum(v * v, axis=-1) + closing**2) / R
+        change = (doppler * wavelength / 2 - closing) / rate
+        t = inside + change
+        if np.abs(change).max(initial=0.0) < 1e-10:
+            return np.asarray(t), np.asarray(R)
+    raise ValueError(
+        f"a point is not seen at a Doppler frequency of {doppler:.6g} Hz between "
+        f"{arc.start:.3f} and {arc.stop:.3f} s"
+    )
