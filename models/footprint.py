@@ -20,6 +20,12 @@ _COARSE = (16, 4)
 """Lines and cells between the points at which terrain is looked up."""
 
 
+_CLOSE = 0.05
+"""How well the height of the terrain must agree with where it is looked up [m]."""
+_ROUNDS = 40
+"""Rounds of looking up; layover, where the height has several values, ends without agreement."""
+
+
 class Footprint:
     """Grid of the places that an acquisition sees, by time and range of the beam's center.
 
@@ -167,20 +173,22 @@ class _Surface:
         self.coefficients = [_chebyshev3(a) for a in (latitude, longitude)]
 
     def on(self, t: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Latitude, longitude [rad] and height [m] of the terrain seen at times and ranges."""
         x, y = (_scaled(a, s) for a, s in zip((t, R), self.spans[:2], strict=True))
-        by_height = [
-            chebyshev.chebgrid2d(x, y, c) for c in self.coefficients
-        ]  # (n_h, n_t, n_R) each
-        h = np.full((len(t), len(R)), self.start)
-        for _ in range(30):
-            z = _scaled(h, self.spans[2])
-            latitude, longitude = (chebyshev.chebval(z, c, tensor=False) for c in by_height)
-            found = self.scene.dem.at(latitude, longitude)
-            step = found - h
-            if np.abs(step).max() < 0.05:
+        n = len(t) * len(R)
+        by_height = [chebyshev.chebgrid2d(x, y, c).reshape(-1, n) for c in self.coefficients]
+        h, place = np.full(n, self.start), np.empty((2, n))
+        moving = np.arange(n)
+        for _ in range(_ROUNDS):
+            z = _scaled(h[moving], self.spans[2])
+            place[:, moving] = [chebyshev.chebval(z, c[:, moving], tensor=False) for c in by_height]
+            step = self.scene.dem.at(*place[:, moving]) - h[moving]
+            h[moving] += 0.7 * step
+            moving = moving[np.abs(step) > _CLOSE]
+            if not len(moving):
                 break
-            h = h + 0.7 * step
-        return latitude, longitude, h
+        shape = (len(t), len(R))
+        return place[0].reshape(shape), place[1].reshape(shape), h.reshape(shape)
 
 
 def _nodes(span: FloatArray, n: int) -> FloatArray:
