@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from terrafix.cosim.ports import Field
+
+FloatArray = NDArray[np.float64]
 
 STATE_AXES = (
     *("r_x", "r_y", "r_z"),
@@ -48,3 +53,31 @@ INNOVATION = {
     "reason": Field((), "1", doc="index into terrafix.models.mekf.REASONS"),
 }
 """What a correction says about the fix it was given."""
+
+ACQUISITION = {
+    "first_time": Field((), "s", doc="of the first line, after the time of validity"),
+    "near_range": Field((), "m", doc="slant range of the first cell"),
+    "beam_range": Field((), "m", doc="slant range to where the beam's center meets the ground"),
+    "beam_doppler": Field((), "Hz", doc="absolute Doppler frequency of the beam's center"),
+}
+"""When and where an echo was received; valid at the time its middle line was."""
+
+IMAGE = {
+    "index": Field((), "1", doc="which of the shared images is this member's"),
+    "row": Field((), "1", doc="row of the beam's center on it, fractional"),
+    "column": Field((), "1", doc="column of the beam's center on it, fractional"),
+    "slant_range": Field((), "m", doc="measured, to the beam's center"),
+    "sine": Field((), "1", doc="of the angle of the beam's center ahead of broadside"),
+    "velocity": Field((), "m/s", doc="effective velocity that focuses it"),
+    "velocity_sigma": Field((), "m/s", doc="standard error of that velocity"),
+    "focused": Field((), "1", doc="1 where autofocus named that velocity, 0 where it refused"),
+}
+"""An image formed with a member's own estimate."""
+
+RADAR_UNITS = ("Hz", "Hz", "Hz", "Hz/s", "s", "Hz")
+RADAR_LABELS = (
+    *("carrier", "prf", "sample_rate"),
+    *("chirp_rate", "pulse_length", "doppler_bandwidth"),
+)
+GRID_LABELS = ("latitude0", "longitude0", "latitude_step", "longitude_step", "mirrored")
+GRID_UNITS = ("rad", "rad", "rad", "rad", "1")

@@ -77,3 +77,31 @@ def geometric_centroid(r: ArrayLike, v: ArrayLike, p: ArrayLike, wavelength: flo
 def unwrapped_centroid(fraction: float, prf: float, expected: float) -> float:
     """Frequency [Hz] congruent to `fraction` modulo `prf` that is nearest to `expected` [Hz]."""
     return fraction + prf * float(np.rint((expected - fraction) / prf))
+
+
+def centroid_candidates(
+    fraction: float, prf: float, expected: float, sigma: float, n_sigma: float = 3.5
+) -> list[float]:
+    """Frequencies [Hz] congruent to `fraction` modulo `prf` that an expectation allows.
+
+    Parameters
+    ----------
+    fraction : float
+        Centroid modulo the repetition frequency [Hz].
+    prf : float
+        Pulse repetition frequency [Hz].
+    expected, sigma : float
+        Centroid from geometry and its standard deviation [Hz].
+    n_sigma : float
+        How far from it the centroid may be, in standard deviations.
+
+    Returns
+    -------
+    list of float
+        The nearest first; never empty.
+    """
+    nearest = unwrapped_centroid(fraction, prf, expected)
+    reach = int(n_sigma * sigma / prf + 1)
+    found = [nearest + k * prf for k in range(-reach, reach + 1)]
+    found = [f for f in found if f == nearest or abs(f - expected) <= n_sigma * sigma]
+    return sorted(found, key=lambda f: abs(f - expected))

@@ -157,8 +157,17 @@ class Image:
     radar: Radar
     velocity_slope: float = 0.0
 
-    def beam(self, row: ArrayLike, column: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """When [s] and at what slant range [m] the beam's center passed what a pixel shows.
+    @property
+    def doppler(self) -> float:
+        """Middle of the compressed band [Hz]."""
+        return (self.band[0] + self.band[1]) / 2
+
+    def seen_at(
+        self, row: ArrayLike, column: ArrayLike, doppler: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """When [s] and at what slant range [m] a pixel was seen with a Doppler frequency [Hz].
+
+        In the middle of the compressed band this is free of errors of the velocity.
 
         Parameters
         ----------
@@ -168,31 +177,27 @@ class Image:
         row, column = (np.asarray(a, dtype=np.float64) for a in (row, column))
         spacing = self.slant_range[1] - self.slant_range[0]
         closest = self.slant_range[0] + spacing * column
-        t = self.t[0] + row / self.radar.prf + self._lag(closest)
-        return t, closest / self._cosine
+        t = self.t[0] + row / self.radar.prf + self._lag(closest, doppler)
+        return t, closest / self._cosine(doppler)
 
-    def pixel(self, t: ArrayLike, slant_range: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Row and column of `data`, fractional, of what the beam's center passed at a time.
-
-        The inverse of `beam`.
-        """
+    def pixel(
+        self, t: ArrayLike, slant_range: ArrayLike, doppler: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Row and column of `data`, fractional, of what was seen then: inverse of `seen_at`."""
         t, slant_range = (np.asarray(a, dtype=np.float64) for a in (t, slant_range))
         spacing = self.slant_range[1] - self.slant_range[0]
-        closest = slant_range * self._cosine
-        row = (t - self._lag(closest) - self.t[0]) * self.radar.prf
+        closest = slant_range * self._cosine(doppler)
+        row = (t - self._lag(closest, doppler) - self.t[0]) * self.radar.prf
         return row, (closest - self.slant_range[0]) / spacing
 
-    @property
-    def _cosine(self) -> float:
-        return float(
-            migration_factor(np.array(self.centroid), self.velocity, self.radar.wavelength)
-        )
+    def _cosine(self, doppler: float) -> float:
+        return float(migration_factor(np.array(doppler), self.velocity, self.radar.wavelength))
 
-    def _lag(self, closest: FloatArray) -> FloatArray:
-        """Seconds from zero Doppler to the passage of the beam's center."""
-        lag = _lag(np.array(self.centroid), self.velocity, self.radar)
+    def _lag(self, closest: FloatArray, doppler: float) -> FloatArray:
+        """Seconds from zero Doppler to another Doppler frequency."""
+        lag = _lag(np.array(doppler), self.velocity, self.radar)
         center = float(self.slant_range[self.columns].mean())
-        return lag * _leverage(closest, center, self.velocity, self.velocity_slope)
+        return np.asarray(lag * _leverage(closest, center, self.velocity, self.velocity_slope))
 
     @property
     def valid(self) -> ComplexArray:

@@ -73,6 +73,23 @@ def local_axes(p: ArrayLike) -> FloatArray:
     return np.stack([east, north, up], axis=-2)
 
 
+def track_axes(p: ArrayLike, v: ArrayLike) -> FloatArray:
+    """Rows along the track, across it, and up at points (..., 3): shape (..., 3, 3), Earth-fixed.
+
+    Parameters
+    ----------
+    p : array_like, shape (..., 3)
+        Points [m].
+    v : array_like, shape (..., 3)
+        Velocity of who passes by [m/s]; the horizontal part at the point is "along".
+    """
+    up = local_axes(p)[..., 2, :]
+    v = np.asarray(v, np.float64)
+    along = v - np.sum(v * up, axis=-1, keepdims=True) * up
+    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    return np.stack([along, np.cross(along, up), up], axis=-2)
+
+
 def ground_point(
     r: ArrayLike, v: ArrayLike, slant_range: ArrayLike, sine: ArrayLike, height: ArrayLike = 0.0
 ) -> FloatArray:
@@ -118,7 +135,7 @@ def ground_point(
     cosine = (sphere**2 + across**2 - radius**2) / (2 * sphere * across)
     if not np.all(np.abs(cosine) < 1):
         raise ValueError(
-            f"a slant range of {float(R.min()):.0f} to {float(R.max()):.0f} m does not reach the ground"
+            f"slant ranges of {R.min():.0f} to {R.max():.0f} m do not all reach the ground"
         )
     look = np.arccos(cosine)
     for _ in range(_STEPS):

@@ -42,6 +42,16 @@ from terrafix.models.model import FloatArray
 KINDS = ("similarity", "affine")
 """Transforms between an image and a reference."""
 
+REASONS = (
+    "accepted",
+    "too few features are shared",
+    "features agree on no plausible transform",
+    "it lies beyond the edge of the reference",
+    "correlation finds no peak where features put it",
+    "its parts do not agree on where it lies",
+)
+"""What became of an image."""
+
 _BLUR = 2.0
 """Of the images in which features are sought [pixels]."""
 _SMOOTH = 1.0
@@ -135,7 +145,7 @@ class Searchable:
 
     @cached_property
     def nepers(self) -> NDArray[np.float32]:
-        """Logarithm of amplitude, in nepers; what is darker than a thousandth of the mean is lifted."""
+        """Logarithm of amplitude; what is nearly black is lifted to a thousandth of the mean."""
         floor = 1e-3 * max(float(self.amplitude.mean()), 1e-30)
         return np.log(np.maximum(self.amplitude, np.float32(floor)))
 
@@ -146,7 +156,7 @@ class Searchable:
 
     @cached_property
     def features(self) -> tuple[FloatArray, NDArray[np.float32]]:
-        """Row, column, size and angle [rad] of features (n, 4), and what they look like (n, 128)."""
+        """Row, column, size, angle [rad] of features (n, 4), and what they look like (n, 128)."""
         blurred = cv2.GaussianBlur(self.nepers, (0, 0), _BLUR)
         low, high = np.percentile(blurred, [0.5, 99.5])
         gray = np.clip((blurred - low) * (255 / max(float(high - low), 1e-6)), 0, 255)

@@ -133,9 +133,9 @@ def geocoded(
         part.start + full_index(t, n)
         for t, part, n in zip(ties, (image.rows, image.columns), looks, strict=True)
     )
-    t, R = image.beam(row[:, None], column[None, :])
+    t, R = image.seen_at(row[:, None], column[None, :], image.doppler)
     r, v = arc.position(t), arc.velocity(t)
-    sine = image.radar.wavelength * image.centroid / (2 * np.linalg.norm(v, axis=-1))
+    sine = image.radar.wavelength * image.doppler / (2 * np.linalg.norm(v, axis=-1))
     p = ground_point_on_terrain(r, v, R, sine, terrain)
     return Reference(amplitude, ties[0], ties[1], *geodetic(p))
 

@@ -31,6 +31,7 @@ from typing import Any
 
 import casadi as ca
 
+from terrafix.models.batch import over_members
 from terrafix.models.earth import EARTH
 from terrafix.models.effective_velocity import effective_velocity
 from terrafix.models.geodesy import ellipsoid_intersection
@@ -96,6 +97,10 @@ def nominal_antenna(look: Any, squint: Any) -> Any:
 def boresight_direction(q_be: Any, q_sb: Any, q_mu: Any) -> Any:
     """Earth-fixed direction (3,) of the antenna's z axis."""
     return rotation_matrix(product(q_mu, product(q_sb, q_be)))[2, :].T
+
+
+nominal_antenna_array = over_members(nominal_antenna, (), ())
+boresight_direction_array = over_members(boresight_direction, (4,), (4,), (4,))
 
 
 def predicted_measurement(

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
 from terrafix.models.attitude import lvlh_quaternion_array
-from terrafix.models.batch import over_members
 from terrafix.models.earth import EARTH, Earth
 from terrafix.models.frames import earth_fixed_from_inertial_array
 from terrafix.models.geodesy import (
@@ -22,9 +20,7 @@ from terrafix.models.geodesy import (
 )
 from terrafix.models.kepler import KeplerianElements
 from terrafix.models.model import FloatArray
-from terrafix.models.sar import boresight_direction, nominal_antenna
-
-boresight_direction_array = over_members(boresight_direction, (4,), (4,), (4,))
+from terrafix.models.sar import boresight_direction_array, nominal_antenna_array
 
 
 @dataclass(frozen=True)
@@ -70,7 +66,7 @@ def boresight_point(
         Its rotation gives the Earth-fixed velocity that the body follows.
     """
     r_e, v_e = earth_fixed_from_inertial_array(r_i, v_i, 0.0, earth.rotation_rate)
-    q_sb = ca.DM(nominal_antenna(look, squint)).full().ravel()
+    q_sb = nominal_antenna_array(look, squint)
     direction = boresight_direction_array(lvlh_quaternion_array(r_e, v_e), q_sb, [0, 0, 0, 1])
     point, hit = ellipsoid_intersection_array(r_e, direction)
     return np.where(hit > 0, point, np.nan)
