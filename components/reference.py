@@ -68,8 +68,8 @@ class EarlierPass(_Reference):
         unit="m",
         doc="of the earlier orbit: along the track, to the right, up",
     )
-    n_lines = Count(4000, minimum=200, doc="lines of the reference, before averaging")
-    n_cells = Count(1200, minimum=200, doc="range cells of the reference, before averaging")
+    n_lines = Count(4800, minimum=200, doc="lines of the reference, before averaging")
+    n_cells = Count(1500, minimum=200, doc="range cells of the reference, before averaging")
     azimuth_looks = Count(2, minimum=1, doc="lines averaged in a pixel")
     range_looks = Count(1, minimum=1, doc="cells averaged in a pixel")
     snr = Parameter(10.0, doc="mean clutter over thermal noise [dB]")

@@ -41,10 +41,11 @@ from scipy import fft
 
 from terrafix.models.arc import OrbitArc
 from terrafix.models.chirp import SPEED_OF_LIGHT, ComplexArray, Radar, chirp_replica, unit_phasor
-from terrafix.models.focusing import batches, stretched
+from terrafix.models.focusing import stretched
 from terrafix.models.footprint import Footprint, TerrainGrid
 from terrafix.models.geolocation import ecef
 from terrafix.models.model import FloatArray
+from terrafix.models.parallel import batches, over
 from terrafix.models.scene import Scene
 
 _DEGREE = 8
@@ -196,8 +197,7 @@ def simulated_echo(
     echo = received(layers, heights, footprint, acquisition, grid_lines)
     aperture = acquisition.illuminated / _doppler_rate(footprint)
     noise = np.sqrt(0.5 * radar.n_pulse * aperture * radar.prf * 10 ** (-snr_db / 10))
-    for rows in batches(len(echo), 256):
-        echo[rows] += np.float32(noise) * _complex_noise(rng, echo[rows].shape)
+    _add_noise(echo, noise, rng)
     return echo
 
 
@@ -229,7 +229,7 @@ def ideal_image(
     _bright_points(layers, terrain, scene, heights)
     image = layers[0]
     image += layers[1]
-    image += np.float32(np.sqrt(0.5 * 10 ** (-snr_db / 10))) * _complex_noise(rng, image.shape)
+    _add_noise(image, np.sqrt(0.5 * 10 ** (-snr_db / 10)), rng)
     spectrum = fft.fft2(image, overwrite_x=True, workers=-1)
     f = fft.fftfreq(footprint.n_lines, 1 / radar.prf)
     f += radar.prf * np.rint((footprint.centroid - f) / radar.prf)
@@ -281,6 +281,18 @@ def _complex_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> ComplexA
     return pairs.view(np.complex64)
 
 
+def _add_noise(image: ComplexArray, sigma: float, rng: np.random.Generator) -> None:
+    """Add noise of a standard deviation in each of both parts, from a stream for each batch."""
+    rows = batches(len(image), 256)
+
+    def add(part: tuple[slice, np.random.Generator]) -> None:
+        noise = _complex_noise(part[1], image[part[0]].shape)
+        noise *= np.float32(sigma)
+        image[part[0]] += noise
+
+    over(zip(rows, rng.spawn(len(rows)), strict=True), add)
+
+
 def _speckle(
     layers: list[ComplexArray],
     terrain: TerrainGrid,
@@ -288,15 +300,21 @@ def _speckle(
     rng: np.random.Generator,
 ) -> None:
     """Add fully developed speckle: a complex normal scatterer on every pixel."""
-    for rows in batches(len(layers[0]), 256):
-        amplitude, share = terrain.pixels(rows.start, rows.stop)
+    rows = batches(len(layers[0]), 256)
+
+    def add(part: tuple[slice, np.random.Generator]) -> None:
+        own, stream = part
+        amplitude, share = terrain.pixels(own.start, own.stop)
         amplitude *= np.float32(np.sqrt(0.5))
         share -= np.float32(heights[0])
         share /= np.float32(heights[1] - heights[0])
-        scatterers = amplitude * _complex_noise(rng, amplitude.shape)
-        layers[1][rows] += share * scatterers
-        scatterers -= layers[1][rows]
-        layers[0][rows] += scatterers
+        scatterers = _complex_noise(stream, amplitude.shape)
+        scatterers *= amplitude
+        layers[1][own] += share * scatterers
+        scatterers -= layers[1][own]
+        layers[0][own] += scatterers
+
+    over(zip(rows, rng.spawn(len(rows)), strict=True), add)
 
 
 def _bright_points(
@@ -408,9 +426,8 @@ def received(
     ranges = footprint.near_range + cells * radar.range_spacing
     by_range = chebyshev.chebvander(_scaled_to(ranges, middle.span), 4).T
     scale = 2 / radar.wavelength
-    for rows in batches(n_lines):
-        if not lit[rows].any():
-            continue
+
+    def compress_inversely(rows: slice) -> None:
         x = np.clip(radar.wavelength * frequency[rows], *middle.domain)
         low, high = (
             spectra[k][rows] * unit_phasor(scale * (histories[k].at(x) @ by_range)) for k in (0, 1)
@@ -418,20 +435,23 @@ def received(
         low += high
         low *= (weight[rows] * lit[rows]).astype(np.float32)[:, None]
         total[rows] = low
-    del spectra
+
+    over([rows for rows in batches(n_lines) if lit[rows].any()], compress_inversely)
+    spectra.clear()
     _migrate(total, frequency, lit, middle, ranges, radar)
     total = fft.fft(total, axis=1, overwrite_x=True, workers=-1)
     pulse = fft.fft(chirp_replica(radar), n_cells).astype(np.complex64) * unit_phasor(-0.125)
     f_r = fft.fftfreq(n_cells, 1 / radar.sample_rate)
-    for rows in batches(n_lines):
-        if not lit[rows].any():
-            continue
+
+    def send(rows: slice) -> None:
         f = np.where(lit[rows], frequency[rows], acquisition.centroid)[:, None]
         own = scale * middle.middle(radar.wavelength * f)
         cycles = 2 * (radar.carrier + f_r) / SPEED_OF_LIGHT
         cycles = cycles * middle.middle(SPEED_OF_LIGHT * f / (radar.carrier + f_r)) - own
         total[rows] *= unit_phasor(cycles)
         total[rows] *= pulse
+
+    over([rows for rows in batches(n_lines) if lit[rows].any()], send)
     total = fft.ifft(total, axis=1, overwrite_x=True, workers=-1)
     total = fft.ifft(total, axis=0, overwrite_x=True, workers=-1)
     shift = round((acquisition.near_range - footprint.near_range) / radar.range_spacing)
@@ -456,7 +476,9 @@ def _migrate(
     ends = [-g(x) + x * g.deriv()(x) for g in (history.g[0], history.g[-1])]
     stretch = (ends[1] - ends[0]) / (history.ranges[-1] - history.ranges[0])
     offset = ranges - np.mean(history.span)
-    for rows in batches(len(spectrum), 256):
-        if lit[rows].any():
-            moved = stretched(spectrum[rows], offset, -stretch[rows], radar.range_spacing)
-            spectrum[rows] = moved
+
+    def move(rows: slice) -> None:
+        moved = stretched(spectrum[rows], offset, -stretch[rows], radar.range_spacing)
+        spectrum[rows] = moved
+
+    over([rows for rows in batches(len(spectrum), 256) if lit[rows].any()], move)

@@ -49,6 +49,7 @@ from terrafix.models.chirp import (
     unit_phasor,
 )
 from terrafix.models.model import FloatArray
+from terrafix.models.parallel import batches, over
 
 _TAPS = 8
 _BLOCK_SHIFT = 0.01
@@ -272,14 +273,23 @@ def range_doppler(
     reference = near_range * d_center + spacing * (n_cells - radar.n_pulse) / 2
     f_r = fft.fftfreq(n_fft, 1 / radar.sample_rate)
     transverse = (SPEED_OF_LIGHT * frequency / (2 * velocity)) ** 2
-    for rows in batches(n_doppler):
+
+    def without_migration(rows: slice) -> None:
         root = np.sqrt((radar.carrier + f_r) ** 2 - transverse[rows, None])
         root -= radar.carrier * d[rows, None]
         root -= f_r * (1 + n_shift * spacing / reference)
         spectrum[rows] *= unit_phasor((2 * reference / SPEED_OF_LIGHT) * root)
+
+    over(batches(n_doppler), without_migration)
     spectrum = fft.ifft(spectrum, axis=1, overwrite_x=True, workers=-1)
     stretch = 1 / d - 1
-    compressed = stretched(spectrum[:, :n_cells], slant_range - reference, stretch, spacing)
+    compressed = np.empty((n_doppler, n_cells), np.complex64)
+
+    def stretch_rows(rows: slice) -> None:
+        offset = slant_range - reference
+        compressed[rows] = stretched(spectrum[rows, :n_cells], offset, stretch[rows], spacing)
+
+    over(batches(n_doppler, 256), stretch_rows)
 
     in_band = np.abs(frequency - centroid) <= radar.doppler_bandwidth / 2
     first = near_range * d[in_band].max()
@@ -351,11 +361,16 @@ def _compressed(
     d = migration_factor(f, velocity, radar.wavelength)
     weights = get_window(window, len(rows), fftbins=False).astype(np.float32)
     data = np.zeros_like(domain.spectrum)
-    for batch in batches(len(rows)):
+
+    def compress(batch: slice) -> None:
         cycles = (2 / radar.wavelength) * np.outer(d[batch] - 1, leverage)
         cycles += (f[batch] * shift)[:, None]
-        data[rows[batch]] = domain.spectrum[rows[batch]] * unit_phasor(cycles)
-        data[rows[batch]] *= weights[batch, None]
+        part = domain.spectrum[rows[batch]]
+        part *= unit_phasor(cycles)
+        part *= weights[batch, None]
+        data[rows[batch]] = part
+
+    over(batches(len(rows)), compress)
     data = fft.ifft(data, axis=0, overwrite_x=True, workers=-1)
     t = domain.first_time + shift + np.arange(len(frequency)) / radar.prf
     edges = slant_range[domain.columns][[0, -1]]
@@ -457,11 +472,6 @@ def _range_scale(domain: RangeDoppler, velocity: float) -> float:
     wavelength = domain.radar.wavelength
     new, old = (migration_factor(f, v, wavelength) for v in (velocity, domain.velocity))
     return float(new / old)
-
-
-def batches(n: int, size: int = 32) -> list[slice]:
-    """Rows by a few, so that what is computed of them stays in the cache."""
-    return [slice(i, min(i + size, n)) for i in range(0, n, size)]
 
 
 def _inside(axis: FloatArray, first: float, last: float, what: str, seen: str) -> slice:

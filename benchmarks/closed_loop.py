@@ -1,0 +1,180 @@
+"""What images are worth as fixes, and the closed loop against the open one with the same errors.
+
+    python benchmarks/closed_loop.py [--sets 7] [--members 8] [--case TC-1]
+
+Every set has a place, a surface, speckle, noise and a misalignment of its own, and flies three
+images with an ensemble of initial errors. Printed are the errors of the fixes over all images, the
+share of updates accepted, predicted and sample velocity sigma after each update, and NEES.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from terrafix.components.fields import FIX
+from terrafix.cosim.clock import Rate
+from terrafix.cosim.component import Component
+from terrafix.cosim.evaluation import chi_square_interval
+from terrafix.cosim.parameters import Parameter
+from terrafix.cosim.ports import Input, MessageOutput
+from terrafix.cosim.run import simulate
+from terrafix.cosim.system import System
+from terrafix.models.boresight import Boresight, boresight_on_terrain
+from terrafix.models.consistency import normalized_square
+from terrafix.models.dem import read_jacksboro
+from terrafix.models.effective_velocity import effective_velocity_array
+from terrafix.models.geolocation import track_axes
+from terrafix.models.mekf import navigation_error_array
+
+SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_closed_loop.toml"
+IMAGING = ("terrain", "echo", "reference", "former", "matcher")
+TIMES = ("8.2", "16.4", "24.6")  # [s]
+LOOK = float(np.radians(34.3))
+SIGMA = {"TC-1": np.radians(0.1), "TC-2": np.radians(0.01)}
+DEM = read_jacksboro().tiled()
+
+
+class DrawnFix(Component):
+    """The fix of the closed loop with errors drawn instead of imaged."""
+
+    default_rate = Rate(times=TIMES)
+
+    geolocation_sigma = Parameter(shape=(3,), unit="m", doc="along the track, across, up")
+    velocity_sigma = Parameter(unit="m/s", doc="of the effective velocity")
+    range_sigma = Parameter(1.0, unit="m", doc="of the slant range")
+
+    r_e = Input((3,), unit="m", frame="e", doc="true position")
+    v_e = Input((3,), unit="m/s", frame="e", doc="true velocity")
+    q_be = Input((4,), unit="1", frame="b", doc="true attitude")
+    q_mu = Input((4,), unit="1", frame="s", doc="true misalignment")
+    fix = MessageOutput(fields=FIX, doc="the fix")
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        noise = self.normals("errors", 5)
+        n = self.n_members
+        y, r_f = np.zeros((n, 4)), np.zeros((n, 3))
+        R, D = np.zeros((n, 4, 4)), np.zeros((n, 3, 3))
+        for m in range(n):
+            beam = boresight(self.r_e[m], self.v_e[m], self.q_be[m], self.q_mu[m])
+            axes = track_axes(beam.point, self.v_e[m])
+            sigma = self.geolocation_sigma[m]
+            V = effective_velocity_array(self.r_e[m], self.v_e[m], beam.point)
+            y[m, 2] = beam.slant_range + self.range_sigma[m] * noise[m, 3]
+            y[m, 3] = V + self.velocity_sigma[m] * noise[m, 4]
+            r_f[m] = beam.point + (sigma * noise[m, :3]) @ axes
+            D[m] = axes.T @ np.diag(sigma**2) @ axes
+            R[m] = np.diag([0.0, 0.0, self.range_sigma[m] ** 2, self.velocity_sigma[m] ** 2])
+        self.fix.publish(t, y=y, r_f_e=r_f, R=R, D=D, present=np.ones((n, 4)))
+
+
+def boresight(r: Any, v: Any, q_be: Any, q_mu: Any) -> Boresight:
+    return boresight_on_terrain(r, v, q_be, q_mu, LOOK, 0.0, DEM)
+
+
+def closed_loop(case: str, number: int) -> System:
+    """One set: a place, a surface and a misalignment of its own."""
+    system = System.from_file(SYSTEM, settings=[("case", case)])
+    rng = np.random.default_rng([20081, number])
+    parts = system.nodes
+    parts["antenna"].misalignment = SIGMA[case] * rng.standard_normal(3)
+    parts["orbit"].earth_angle0 = 0.37 * number + 0.001 * rng.random()
+    parts["terrain"].surface_seed = 100 + number
+    system.record("pointing", [parts["attitude"]["q_be"], parts["antenna"]["q_mu"]], period="8.2")
+    return system
+
+
+def open_loop(case: str, number: int) -> System:
+    """The same without images: errors of the fix are drawn from its covariances."""
+    system = closed_loop(case, number)
+    matcher, former = system.nodes["matcher"], system.nodes["former"]
+    drawn = DrawnFix(
+        geolocation_sigma=matcher.setting("geolocation_sigma"),
+        velocity_sigma=former.setting("velocity_sigma"),
+        range_sigma=former.setting("range_sigma"),
+    )
+    system.records = [r for r in system.records if r.name != "fixes"]
+    for name in IMAGING:
+        system.remove(name)
+    parts = system.nodes
+    fix = system.add(drawn, "matcher")
+    for source, port in (("orbit", "r_e"), ("orbit", "v_e"), ("attitude", "q_be"), ("antenna", "q_mu")):
+        system.connect(parts[source][port], fix[port])
+    system.connect(fix["fix"], parts["correct"]["fix"])
+    system.record("fixes", [fix["fix"]], period="8.2")
+    return system
+
+
+def outcome(system: System, number: int, members: int) -> dict[str, Any]:
+    """Errors of fixes and estimates at the three updates of one set."""
+    data = simulate(system, members=members, seed=5000 + number).dataset
+
+    def at(name: str, t: float) -> np.ndarray:
+        values = data[name]
+        return values.sel({values.dims[0]: t}, method="nearest").to_numpy()
+
+    found: dict[str, Any] = {k: [] for k in ("fix", "velocity", "accepted", "error", "P")}
+    for t in map(float, TIMES):
+        r, v = at("orbit.r_e", t), at("orbit.v_e", t)
+        q_be, q_mu = at("attitude.q_be", t), at("antenna.q_mu", t)
+        beam = boresight(r[0], v[0], q_be[0], q_mu[0])
+        axes = track_axes(beam.point, v[0])
+        found["fix"].append((at("matcher.fix.r_f_e", t) - beam.point) @ axes.T)
+        V = effective_velocity_array(r[0], v[0], beam.point)
+        y, present = at("matcher.fix.y", t), at("matcher.fix.present", t)
+        found["velocity"].append(np.where(present[:, 3] > 0, y[:, 3] - V, np.nan))
+        found["accepted"].append(at("correct.innovation.accepted", t) > 0)
+        estimate = [at(f"correct.estimate.{k}", t) for k in ("r_e", "v_e", "q_mu")]
+        found["error"].append(navigation_error_array(r, v, q_mu, *estimate))
+        found["P"].append(at("correct.estimate.P", t))
+    return {k: np.array(x) for k, x in found.items()}
+
+
+def table(case: str, sets: int, members: int) -> None:
+    started = time.perf_counter()
+    closed = [outcome(closed_loop(case, k), k, members) for k in range(sets)]
+    print(f"closed loop, {case}: {sets} sets of {members}, {time.perf_counter() - started:.0f} s")
+    opened = [outcome(open_loop(case, k), k, max(members, 60)) for k in range(sets)]
+
+    first = np.array([[s["fix"][k, 0] for k in range(3)] for s in closed]).reshape(-1, 3)
+    speed = np.array([[s["velocity"][k, 0] for k in range(3)] for s in closed]).ravel()
+    fixed = np.isfinite(first[:, 0])
+    errors, n = first[fixed], int(fixed.sum())
+    print(f"fixes: {n} of {len(first)} images recognized")
+    mean, standard = errors.mean(axis=0), errors.std(axis=0, ddof=1) / np.sqrt(n)
+    for axis, m, s, e in zip(("along", "across", "up"), mean, standard, errors.T, strict=True):
+        print(f"  {axis:7s} mean {m:7.2f} m, {m / max(s, 1e-9):5.1f} standard errors; rms {np.sqrt(np.mean(e**2)):.2f} m, largest {np.abs(e).max():.2f} m")
+    print("  covariance [m^2]", np.round(np.cov(errors.T), 2).tolist())
+    V = speed[np.isfinite(speed)]
+    print(f"  effective velocity: {len(V)} focused, mean {V.mean():.3f}, rms {np.sqrt(np.mean(V**2)):.3f} m/s, largest {np.abs(V).max():.2f}")
+
+    accepted = np.mean([s["accepted"] for s in closed])
+    print(f"updates accepted: {100 * accepted:.1f} %")
+    for k in range(3):
+        rows = []
+        for runs in (closed, opened):
+            e = np.concatenate([s["error"][k] for s in runs])
+            P = np.concatenate([s["P"][k] for s in runs])
+            predicted = np.sqrt(np.mean(np.diagonal(P, axis1=1, axis2=2), axis=0))
+            rows.append((predicted, np.sqrt(np.mean(e**2, axis=0)), normalized_square(e, P)))
+        (p, s, nees), (p0, s0, nees0) = rows
+        own = [float(np.mean(normalized_square(x["error"][k], x["P"][k]))) for x in closed]
+        low, high = chi_square_interval(9.0, sets)
+        print(f"update {k + 1}: velocity sigma predicted {np.round(p[3:6], 3)} (open {np.round(p0[3:6], 3)}), sample {np.round(s[3:6], 3)} (open {np.round(s0[3:6], 3)})")
+        print(f"   rss ratio to the open loop: predicted {np.linalg.norm(p[3:6]) / np.linalg.norm(p0[3:6]):.3f}, sample {np.linalg.norm(s[3:6]) / np.linalg.norm(s0[3:6]):.3f}; NEES {nees.mean():.2f} (open {nees0.mean():.2f}), bounds for {sets} sets {low:.2f} to {high:.2f}; by set {np.round(own, 1)}")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"peak memory {peak:.2f} GiB, {time.perf_counter() - started:.0f} s")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sets", type=int, default=7)
+    parser.add_argument("--members", type=int, default=8)
+    parser.add_argument("--case", choices=SIGMA, default="TC-1")
+    arguments = parser.parse_args()
+    table(arguments.case, arguments.sets, arguments.members)
