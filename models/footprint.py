@@ -178,15 +178,19 @@ class _Surface:
         n = len(t) * len(R)
         by_height = [chebyshev.chebgrid2d(x, y, c).reshape(-1, n) for c in self.coefficients]
         h, place = np.full(n, self.start), np.empty((2, n))
-        moving = np.arange(n)
-        for _ in range(_ROUNDS):
+        moving, step, missed = np.arange(n), np.ones(n), np.zeros(n)
+        for k in range(_ROUNDS):
             z = _scaled(h[moving], self.spans[2])
             place[:, moving] = [chebyshev.chebval(z, c[:, moving], tensor=False) for c in by_height]
-            step = self.scene.dem.at(*place[:, moving]) - h[moving]
-            h[moving] += 0.7 * step
-            moving = moving[np.abs(step) > _CLOSE]
+            miss = self.scene.dem.at(*place[:, moving]) - h[moving]
+            # secant, its slope held to what terrain short of layover can have
+            slope = (missed - miss) / step if k else np.ones(n)
+            still = np.abs(miss) > _CLOSE
+            step = (miss / np.clip(slope, 0.3, 2.5))[still]
+            moving, missed = moving[still], miss[still]
             if not len(moving):
                 break
+            h[moving] += step
         shape = (len(t), len(R))
         return place[0].reshape(shape), place[1].reshape(shape), h.reshape(shape)
 
