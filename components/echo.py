@@ -89,12 +89,12 @@ class _Echo(Component):
     def _publish(self, t: float, echo: ComplexArray, first_time: float, near: float) -> None:
         beam = self._boresight()
         radar = self._radar()
-        reach = near + (echo.shape[1] - radar.n_pulse) * radar.range_spacing
+        reach = near + (echo.shape[1] - 1) * radar.range_spacing
         if not near <= beam.slant_range <= reach:
             raise ConfigurationError(
                 f"the boresight of '{self.name}' meets the ground at a slant range of "
-                f"{beam.slant_range:.0f} m, but whole pulses were received from {near:.0f} to "
-                f"{reach:.0f} m\n  look at the same place: set {self.name}.look, or the orbit"
+                f"{beam.slant_range:.0f} m, but echo was received from {near:.0f} to {reach:.0f} m\n"
+                f"  look at the same place: set {self.name}.look, or the orbit"
             )
         self.echo = echo
         self.acquired.publish(

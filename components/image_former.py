@@ -56,6 +56,9 @@ class ImageFormer(Component):
     band = Parameter(
         [0.0, 1.0], shape=(2,), minimum=0.0, maximum=1.0, doc="part of the Doppler band shown"
     )
+    exposure = Parameter(
+        1.0, positive=True, maximum=1.0, doc="share of a pulse received where columns are used"
+    )
     azimuth_looks = Count(2, minimum=1, doc="lines averaged in a pixel")
     range_looks = Count(1, minimum=1, doc="cells averaged in a pixel")
     rows = Count(500, minimum=96, doc="of the detected image")
@@ -94,6 +97,7 @@ class ImageFormer(Component):
                 step=float(self.velocity_step[k]),
                 migration_step=float(self.migration_step[k]),
                 band=(float(self.band[k, 0]), float(self.band[k, 1])),
+                exposure=float(self.exposure[k]),
             )
             self._form(t, imager, fresh)
         except ValueError as error:

@@ -126,6 +126,9 @@ class RecordedReference(_Reference):
     )
     look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
+    exposure = Parameter(
+        1.0, positive=True, maximum=1.0, doc="share of a pulse received where columns are used"
+    )
     velocity_step = Parameter(1.0, unit="m/s", positive=True, doc="grid of autofocus")
     azimuth_looks = Count(1, minimum=1, doc="lines averaged in a pixel")
     range_looks = Count(1, minimum=1, doc="cells averaged in a pixel")
@@ -152,9 +155,12 @@ class RecordedReference(_Reference):
         radar = Radar(*map(float, self.radar))
         first_time = (lines.first_line - float(common(self, "start_line"))) / radar.prf - t
         near = float(common(self, "range0")) + (lines.first_cell - 1) * radar.range_spacing
-        r, v, q_be, look, squint, band, step = (
+        r, v, q_be, look, squint, band, step, exposure = (
             common(self, name)
-            for name in ("r_e", "v_e", "q_be", "look", "squint", "band", "velocity_step")
+            for name in (
+                *("r_e", "v_e", "q_be", "look", "squint"),
+                *("band", "velocity_step", "exposure"),
+            )
         )
         dem = dem_from(self.height, self.grid)
         aligned = np.array([0.0, 0.0, 0.0, 1.0])
@@ -168,6 +174,7 @@ class RecordedReference(_Reference):
                 first_time,
                 step=float(step),
                 band=(float(band[0]), float(band[1])),
+                exposure=float(exposure),
             )
             centroid = unwrapped_centroid(
                 imager.fraction, radar.prf, beam.doppler(radar.wavelength)

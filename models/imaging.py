@@ -58,6 +58,8 @@ class Imager:
     band : tuple of float
         Part of the processed Doppler band that images show, from 0 to 1: a look. Autofocus uses
         the whole band.
+    exposure : float
+        Share of a pulse that must have been received for a column to be used.
 
     Raises
     ------
@@ -75,6 +77,7 @@ class Imager:
         step: float = 1.0,
         migration_step: float = 50.0,
         band: tuple[float, float] = (0.0, 1.0),
+        exposure: float = 1.0,
     ) -> None:
         if not (step > 0 and migration_step > 0):
             raise ValueError(f"steps of {step} and {migration_step} m/s must be positive")
@@ -83,6 +86,7 @@ class Imager:
         self.echo, self.radar = echo, radar
         self.near_range, self.first_time = near_range, first_time
         self.step, self.migration_step, self.band = step, migration_step, band
+        self.exposure = exposure
         self.fraction, self.coherence = fractional_centroid(echo, radar.prf)
         self._curves: dict[Processing, SharpnessCurve] = {}
         self._focused: dict[tuple[Processing, int], Focus] = {}
@@ -107,6 +111,7 @@ class Imager:
                 velocity=processing.velocity,
                 velocity_slope=processing.velocity_slope,
                 first_time=self.first_time,
+                exposure=self.exposure,
             )
             self._curves[processing] = SharpnessCurve(domain.cropped(), self.step)
         return self._curves[processing]

@@ -51,8 +51,12 @@ REASONS = (
     "gate",
     "innovation covariance not positive definite",
     "nothing measured",
+    "not of this instant",
 )
 """What became of a fix, indexed by ``innovation.reason``."""
+
+_SAME_INSTANT = 1e-6
+"""Largest difference of time between a fix and the prior that it corrects [s]."""
 
 ESTIMATE_FIELDS = {"r_e": (3, 1), "v_e": (3, 1), "q_mu": (4, 1), "P": (9, 9)}
 """Shapes of the fields of an estimate."""
@@ -232,7 +236,8 @@ def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
     Model
         Inputs ``prior.r_e``, ``.v_e``, ``.q_mu``, ``.P``; ``fix.y`` (4,), ``fix.r_f_e`` (3,),
         ``fix.R`` (4, 4), ``fix.D`` (3, 3), ``fix.present`` (4,), 1 where an element was measured,
-        the flag ``fix.fresh``; ``q_be`` (4,). Parameters ``look``, ``squint`` [rad],
+        the flag ``fix.fresh`` and the time ``fix.t`` [s], which must be that of the prior; ``q_be``
+        (4,). Parameters ``look``, ``squint`` [rad],
         ``underweighting``, the factor applied to the first ``underweighted_updates`` fixes,
         accepted or not; ``gate`` (4,), the largest normalized innovation squared accepted with 1
         to 4 elements (infinity: all). Outputs ``estimate.r_e``, ``.v_e``, ``.q_mu``, ``.P``: the
@@ -253,6 +258,7 @@ def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
     shapes = {"y": (4, 1), "r_f_e": (3, 1), "R": (4, 4), "D": (3, 3), "present": (4, 1)}
     fix = {k: ca.SX.sym(f"fix_{k}", *shape) for k, shape in shapes.items()}
     fresh, q_be = ca.SX.sym("fix_fresh"), ca.SX.sym("q_be", 4)
+    fix_t, time = ca.SX.sym("fix_t"), ca.SX.sym("time")
     names = ("look", "squint", "underweighting", "underweighted_updates")
     parameters = {name: ca.SX.sym(name) for name in names}
     look, squint, underweighting, underweighted_updates = parameters.values()
@@ -261,6 +267,7 @@ def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
         **{f"prior.{k}": s for k, s in prior.items()},
         **{f"fix.{k}": s for k, s in fix.items()},
         "fix.fresh": fresh,
+        "fix.t": fix_t,
         "q_be": q_be,
     }
 
@@ -279,6 +286,10 @@ def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
             REASONS.index("innovation covariance not positive definite"),
             ca.if_else(outcome.nis <= threshold, 0, REASONS.index("gate")),
         ),
+    )
+    # between a pixel and a prior of another instant lie meters per millisecond
+    reason = ca.if_else(
+        ca.fabs(fix_t - time) <= _SAME_INSTANT, reason, REASONS.index("not of this instant")
     )
     accepted = ca.logic_and(arrived, reason == 0)
     corrected = {
@@ -307,6 +318,7 @@ def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
             "innovation.valid": arrived,
             "innovation.reason": reason,
         },
+        time=time,
     )
 
 

@@ -1,7 +1,7 @@
 """Where to start an orbit so that a side-looking antenna sees a given place.
 
 The node and the anomaly of an orbit of given shape are solved so that the boresight of an antenna
-on a level, yaw-steered body meets the ellipsoid at the place. Inertial and Earth-fixed axes
+on a level body meets the ellipsoid at the place. Inertial and Earth-fixed axes
 coincide at that instant.
 """
 
@@ -52,7 +52,12 @@ class OrbitShape:
 
 
 def boresight_point(
-    r_i: FloatArray, v_i: FloatArray, look: float, squint: float, earth: Earth = EARTH
+    r_i: FloatArray,
+    v_i: FloatArray,
+    look: float,
+    squint: float,
+    earth: Earth = EARTH,
+    velocity: str = "earth-fixed",
 ) -> FloatArray:
     """Where the boresight meets the ellipsoid, (3,) Earth-fixed [m]; NaN where it misses.
 
@@ -63,11 +68,14 @@ def boresight_point(
     look, squint : float
         Angles of the nominal antenna [rad].
     earth : Earth
-        Its rotation gives the Earth-fixed velocity that the body follows.
+        Its rotation gives the Earth-fixed velocity.
+    velocity : {"earth-fixed", "inertial"}
+        Velocity that the body follows.
     """
     r_e, v_e = earth_fixed_from_inertial_array(r_i, v_i, 0.0, earth.rotation_rate)
     q_sb = nominal_antenna_array(look, squint)
-    direction = boresight_direction_array(lvlh_quaternion_array(r_e, v_e), q_sb, [0, 0, 0, 1])
+    q_be = lvlh_quaternion_array(r_e, v_i if velocity == "inertial" else v_e)
+    direction = boresight_direction_array(q_be, q_sb, [0, 0, 0, 1])
     point, hit = ellipsoid_intersection_array(r_e, direction)
     return np.where(hit > 0, point, np.nan)
 
@@ -79,6 +87,7 @@ def boresight_start(
     look: float,
     squint: float = 0.0,
     earth: Earth = EARTH,
+    velocity: str = "earth-fixed",
 ) -> tuple[FloatArray, FloatArray]:
     """Inertial position [m] and velocity [m/s], (3,) each, ascending, looking at a place.
 
@@ -92,6 +101,8 @@ def boresight_start(
         Angles of the nominal antenna [rad].
     earth : Earth
         Gravitational parameter and rotation.
+    velocity : {"earth-fixed", "inertial"}
+        Velocity that the body follows.
 
     Raises
     ------
@@ -103,7 +114,7 @@ def boresight_start(
     def miss(angles: FloatArray) -> FloatArray:
         state = shape.elements(float(angles[0]), float(angles[1])).state(earth.mu)
         hit_latitude, hit_longitude, _ = geodetic_from_ecef_array(
-            boresight_point(*state, look, squint, earth)
+            boresight_point(*state, look, squint, earth, velocity)
         )
         turns = np.round((hit_longitude - longitude) / (2 * np.pi))
         return np.array([hit_latitude - latitude, hit_longitude - longitude - 2 * np.pi * turns])
