@@ -30,6 +30,7 @@ from terrafix.models.consistency import normalized_square
 from terrafix.models.dem import read_jacksboro
 from terrafix.models.effective_velocity import effective_velocity_array
 from terrafix.models.geolocation import track_axes
+from terrafix.models.matching import REASONS as MATCHED
 from terrafix.models.mekf import navigation_error_array
 
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_closed_loop.toml"
@@ -118,7 +119,7 @@ def outcome(system: System, number: int, members: int) -> dict[str, Any]:
         values = data[name]
         return values.sel({values.dims[0]: t}, method="nearest").to_numpy()
 
-    found: dict[str, Any] = {k: [] for k in ("fix", "velocity", "accepted", "error", "P")}
+    found: dict[str, Any] = {k: [] for k in ("fix", "velocity", "accepted", "reason", "error", "P")}
     for t in map(float, TIMES):
         r, v = at("orbit.r_e", t), at("orbit.v_e", t)
         q_be, q_mu = at("attitude.q_be", t), at("antenna.q_mu", t)
@@ -129,6 +130,8 @@ def outcome(system: System, number: int, members: int) -> dict[str, Any]:
         y, present = at("matcher.fix.y", t), at("matcher.fix.present", t)
         found["velocity"].append(np.where(present[:, 3] > 0, y[:, 3] - V, np.nan))
         found["accepted"].append(at("correct.innovation.accepted", t) > 0)
+        reason = at("matcher.reason", t) if "matcher.reason" in data else np.zeros(members)
+        found["reason"].append(np.nan_to_num(reason))
         estimate = [at(f"correct.estimate.{k}", t) for k in ("r_e", "v_e", "q_mu")]
         found["error"].append(navigation_error_array(r, v, q_mu, *estimate))
         found["P"].append(at("correct.estimate.P", t))
@@ -155,6 +158,9 @@ def table(case: str, sets: int, members: int) -> None:
 
     accepted = np.mean([s["accepted"] for s in closed])
     print(f"updates accepted: {100 * accepted:.1f} %")
+    for number, found in enumerate(closed):
+        for k, m in np.argwhere(~found["accepted"]):
+            print(f"  set {number}, member {m}, update {k + 1}: {MATCHED[int(found['reason'][k, m])]}")
     for k in range(3):
         rows = []
         for runs in (closed, opened):

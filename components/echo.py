@@ -93,7 +93,8 @@ class _Echo(Component):
         if not near <= beam.slant_range <= reach:
             raise ConfigurationError(
                 f"the boresight of '{self.name}' meets the ground at a slant range of "
-                f"{beam.slant_range:.0f} m, but echo was received from {near:.0f} to {reach:.0f} m\n"
+                f"{beam.slant_range:.0f} m, but echo was received from {near:.0f} to "
+                f"{reach:.0f} m\n"
                 f"  look at the same place: set {self.name}.look, or the orbit"
             )
         self.echo = echo

@@ -66,6 +66,7 @@ class ImageMatcher(Component):
     match_sigma = Output(doc="of the last image: standard error of its place [pixels]")
     match_place = Output((2,), labels=("row", "column"), doc="of its center on the reference")
     inliers = SharedOutput((None, 4), doc="features of the first image and of the reference")
+    outline = SharedOutput((4, 2), doc="corners of the first image on it; NaN if not found")
 
     def _step_impl(self, t: float, dt: float) -> None:
         fresh = self.image.fresh & self.environment.active
@@ -94,6 +95,9 @@ class ImageMatcher(Component):
                 valid[m] = True
         first = next(iter(found.values()))
         self.inliers = first.inliers
+        rows, columns = self.images.shape[1:]
+        corners = [(0, 0, 1), (0, columns - 1, 1), (rows - 1, columns - 1, 1), (rows - 1, 0, 1)]
+        self.outline = np.array(corners) @ first.transform.T
         if not valid.any():
             self._require_coverage(reference, fresh)
             return
