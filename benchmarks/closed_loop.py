@@ -34,7 +34,7 @@ from terrafix.models.matching import REASONS as MATCHED
 from terrafix.models.mekf import navigation_error_array
 
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_closed_loop.toml"
-IMAGING = ("terrain", "echo", "reference", "former", "matcher")
+IMAGING = ("terrain", "echo", "reference", "former", "matcher", "album")
 TIMES = ("8.2", "16.4", "24.6")  # [s]
 LOOK = float(np.radians(34.3))
 SIGMA = {"TC-1": np.radians(0.1), "TC-2": np.radians(0.01)}

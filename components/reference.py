@@ -183,7 +183,8 @@ class RecordedReference(_Reference):
             processing = imager.processing(centroid, velocity, 0.0)
             _, focus = imager.focus([processing], velocity)
             image = imager.image(processing, focus.velocity if focus.accepted else velocity)
-            arc = OrbitArc(r, v, 0.0, 2 * duration + abs(first_time), 2 * duration)
+            reach = abs(first_time) + 3 * duration
+            arc = OrbitArc(r, v, 0.0, reach, reach)
             looks = self.azimuth_looks, self.range_looks
             reference = geocoded(image, arc, dem.at, looks)
         except ValueError as error:
