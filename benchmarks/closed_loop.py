@@ -104,7 +104,8 @@ def open_loop(case: str, number: int) -> System:
         system.remove(name)
     parts = system.nodes
     fix = system.add(drawn, "matcher")
-    for source, port in (("orbit", "r_e"), ("orbit", "v_e"), ("attitude", "q_be"), ("antenna", "q_mu")):
+    truth = (("orbit", "r_e"), ("orbit", "v_e"), ("attitude", "q_be"), ("antenna", "q_mu"))
+    for source, port in truth:
         system.connect(parts[source][port], fix[port])
     system.connect(fix["fix"], parts["correct"]["fix"])
     system.record("fixes", [fix["fix"]], period="8.2")
@@ -138,41 +139,66 @@ def outcome(system: System, number: int, members: int) -> dict[str, Any]:
     return {k: np.array(x) for k, x in found.items()}
 
 
-def table(case: str, sets: int, members: int) -> None:
-    started = time.perf_counter()
-    closed = [outcome(closed_loop(case, k), k, members) for k in range(sets)]
-    print(f"closed loop, {case}: {sets} sets of {members}, {time.perf_counter() - started:.0f} s")
-    opened = [outcome(open_loop(case, k), k, max(members, 60)) for k in range(sets)]
-
-    first = np.array([[s["fix"][k, 0] for k in range(3)] for s in closed]).reshape(-1, 3)
-    speed = np.array([[s["velocity"][k, 0] for k in range(3)] for s in closed]).ravel()
-    fixed = np.isfinite(first[:, 0])
-    errors, n = first[fixed], int(fixed.sum())
+def fixes(closed: list[dict[str, Any]]) -> None:
+    """Errors of the fixes over all images, from the first member of every set."""
+    first = np.array([s["fix"][k, 0] for s in closed for k in range(3)])
+    errors = first[np.isfinite(first[:, 0])]
+    n = len(errors)
     print(f"fixes: {n} of {len(first)} images recognized")
     mean, standard = errors.mean(axis=0), errors.std(axis=0, ddof=1) / np.sqrt(n)
     for axis, m, s, e in zip(("along", "across", "up"), mean, standard, errors.T, strict=True):
-        print(f"  {axis:7s} mean {m:7.2f} m, {m / max(s, 1e-9):5.1f} standard errors; rms {np.sqrt(np.mean(e**2)):.2f} m, largest {np.abs(e).max():.2f} m")
+        print(
+            f"  {axis:7s} mean {m:6.2f} m = {m / s:5.1f} standard errors; rms "
+            f"{np.sqrt(np.mean(e**2)):.2f} m, largest {np.abs(e).max():.2f} m"
+        )
     print("  covariance [m^2]", np.round(np.cov(errors.T), 2).tolist())
-    V = speed[np.isfinite(speed)]
-    print(f"  effective velocity: {len(V)} focused, mean {V.mean():.3f}, rms {np.sqrt(np.mean(V**2)):.3f} m/s, largest {np.abs(V).max():.2f}")
+    V = np.array([s["velocity"][k, 0] for s in closed for k in range(3)])
+    V = V[np.isfinite(V)]
+    print(
+        f"  effective velocity: {len(V)} focused, mean {V.mean():.3f}, rms "
+        f"{np.sqrt(np.mean(V**2)):.3f}, largest {np.abs(V).max():.2f} m/s"
+    )
 
-    accepted = np.mean([s["accepted"] for s in closed])
-    print(f"updates accepted: {100 * accepted:.1f} %")
+
+def updates(closed: list[dict[str, Any]], opened: list[dict[str, Any]]) -> None:
+    """Share of updates accepted; velocity sigma and NEES after each, beside the open loop's."""
+    print(f"updates accepted: {100 * np.mean([s['accepted'] for s in closed]):.1f} %")
     for number, found in enumerate(closed):
         for k, m in np.argwhere(~found["accepted"]):
-            print(f"  set {number}, member {m}, update {k + 1}: {MATCHED[int(found['reason'][k, m])]}")
+            why = MATCHED[int(found["reason"][k, m])]
+            print(f"  set {number}, member {m}, update {k + 1}: {why}")
+    low, high = chi_square_interval(9.0, len(closed))
     for k in range(3):
         rows = []
         for runs in (closed, opened):
             e = np.concatenate([s["error"][k] for s in runs])
             P = np.concatenate([s["P"][k] for s in runs])
             predicted = np.sqrt(np.mean(np.diagonal(P, axis1=1, axis2=2), axis=0))
-            rows.append((predicted, np.sqrt(np.mean(e**2, axis=0)), normalized_square(e, P)))
-        (p, s, nees), (p0, s0, nees0) = rows
+            rows.append((predicted[3:6], np.sqrt(np.mean(e[:, 3:6] ** 2, axis=0)), e, P))
+        (p, s, e, P), (p0, s0, e0, P0) = rows
         own = [float(np.mean(normalized_square(x["error"][k], x["P"][k]))) for x in closed]
-        low, high = chi_square_interval(9.0, sets)
-        print(f"update {k + 1}: velocity sigma predicted {np.round(p[3:6], 3)} (open {np.round(p0[3:6], 3)}), sample {np.round(s[3:6], 3)} (open {np.round(s0[3:6], 3)})")
-        print(f"   rss ratio to the open loop: predicted {np.linalg.norm(p[3:6]) / np.linalg.norm(p0[3:6]):.3f}, sample {np.linalg.norm(s[3:6]) / np.linalg.norm(s0[3:6]):.3f}; NEES {nees.mean():.2f} (open {nees0.mean():.2f}), bounds for {sets} sets {low:.2f} to {high:.2f}; by set {np.round(own, 1)}")
+        print(
+            f"update {k + 1}: velocity sigma predicted {np.round(p, 3)} (open {np.round(p0, 3)}), "
+            f"sample {np.round(s, 3)} (open {np.round(s0, 3)})"
+        )
+        print(
+            f"  ratio to the open loop, root sum of squares: predicted "
+            f"{np.linalg.norm(p) / np.linalg.norm(p0):.3f}, sample "
+            f"{np.linalg.norm(s) / np.linalg.norm(s0):.3f}"
+        )
+        print(
+            f"  NEES {normalized_square(e, P).mean():.2f} (open "
+            f"{normalized_square(e0, P0).mean():.2f}), bounds for {len(closed)} sets {low:.2f} to "
+            f"{high:.2f}; by set {np.round(own, 1)}"
+        )
+
+
+def table(case: str, sets: int, members: int) -> None:
+    started = time.perf_counter()
+    closed = [outcome(closed_loop(case, k), k, members) for k in range(sets)]
+    print(f"closed loop, {case}: {sets} sets of {members}, {time.perf_counter() - started:.0f} s")
+    fixes(closed)
+    updates(closed, [outcome(open_loop(case, k), k, max(members, 60)) for k in range(sets)])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GiB, {time.perf_counter() - started:.0f} s")
 

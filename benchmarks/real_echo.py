@@ -201,7 +201,8 @@ def main(members: int) -> None:
     for t in map(float, TIMES):
         own = velocity(data, t)
         others = np.sqrt(np.mean([np.square(velocity(d, t)) for d in opened], axis=0))
-        ratio = [float(np.linalg.norm(a) / np.linalg.norm(b)) for a, b in zip(own, others, strict=True)]
+        pairs = zip(own, others, strict=True)
+        ratio = [float(np.linalg.norm(a) / np.linalg.norm(b)) for a, b in pairs]
         print(
             f"  {t:g} s velocity sigma: predicted {np.round(own[0], 3)}, ratio to the open loop "
             f"{ratio[0]:.3f}; sample {np.round(own[1], 3)}, ratio {ratio[1]:.3f}; rms error "
