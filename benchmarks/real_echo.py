@@ -14,8 +14,9 @@ import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import cv2
 import numpy as np
 
 from terrafix.components.fields import FIX
@@ -55,6 +56,25 @@ class MisplacedReference(RecordedReference):
     def _publish(self, reference: Reference) -> None:
         off = 10e3 / 6.37e6
         super()._publish(replace(reference, latitude=reference.latitude + off))
+
+
+class OtherPlace(RecordedReference):
+    """A reference whose image is that of the step before, or of the last: another place."""
+
+    images: ClassVar[list[np.ndarray]] = []
+
+    def _publish(self, reference: Reference) -> None:
+        n_rows, n_columns = reference.amplitude.shape
+        other = cv2.resize(self.images[self.step_index - 2], (n_columns, n_rows))
+        super()._publish(replace(reference, amplitude=other))
+
+
+class Kept(RecordedReference):
+    """A reference whose images are kept for `OtherPlace`."""
+
+    def _publish(self, reference: Reference) -> None:
+        OtherPlace.images.append(reference.amplitude)
+        super()._publish(reference)
 
 
 class CommonFix(Component):
@@ -178,12 +198,10 @@ def verdicts(title: str, system: System, members: int) -> None:
     print(f"{title}: {dict(refused)}")
 
 
-def with_reference(kind: type[RecordedReference], files: str | None = None) -> System:
+def with_reference(kind: type[RecordedReference]) -> System:
     system = real_echo()
     old = system.nodes["reference"]
     settings = {name: old.setting(name) for name in old.settings()}
-    if files is not None:
-        settings["files"] = files
     system.replace("reference", kind(rate=old.rate, **settings))
     return system
 
@@ -210,8 +228,8 @@ def main(members: int) -> None:
         )
     few = max(members // 5, 2)
     verdicts("mirrored reference", with_reference(MirroredReference), few)
-    files = "english_bay_2.npz airport.npz stanley_park.npz"
-    verdicts("reference of another place", with_reference(RecordedReference, files), few)
+    simulate(with_reference(Kept), members=1)
+    verdicts("reference of another place", with_reference(OtherPlace), few)
     verdicts("geocoding 10 km off", with_reference(MisplacedReference), few)
 
 

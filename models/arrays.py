@@ -36,7 +36,8 @@ def read_arrays(
     if not path.is_file():
         raise FileNotFoundError(f"'{path}' {'is a folder' if path.is_dir() else 'is not there'}")
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
             if not hasattr(archive, "files"):
                 raise ValueError("it holds one array without a name")
             missing = [k for k in keys if k not in archive.files]

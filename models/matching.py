@@ -56,6 +56,8 @@ _BLUR = 2.0
 """Of the images in which features are sought [pixels]."""
 _SMOOTH = 1.0
 """Of the images that are correlated [pixels]."""
+_BROAD = 10.0
+"""Of what is subtracted from them [pixels]."""
 _REACH = 8
 """Largest shift that correlation looks for [pixels]."""
 _SMALLEST = 96
@@ -67,10 +69,10 @@ _THRESHOLD = 3.0
 """How far off features may be [pixels]."""
 _TURN, _GROWTH = float(np.radians(30.0)), 1.5
 """How much a feature may be turned and grown between the images."""
-_FEWEST = 4
-"""Features that must share a transform."""
-_STRETCH = 1.2
-"""Largest stretch along any direction, either way."""
+_FEWEST = 7
+"""Features that must share a transform: fewer also share one by chance."""
+_STRETCH = 1.08
+"""Largest stretch along any direction, either way: image and reference have like pixels."""
 _SEEN = 0.8
 """Share of the image that must lie on the reference."""
 _ROUNDS, _CLOSE = 30, 1e-4
@@ -151,8 +153,9 @@ class Searchable:
 
     @cached_property
     def smooth(self) -> NDArray[np.float32]:
-        """What is correlated."""
-        return np.asarray(cv2.GaussianBlur(self.nepers, (0, 0), _SMOOTH))
+        """What is correlated: details, without trends that correlate wherever they are moved."""
+        fine, broad = (cv2.GaussianBlur(self.nepers, (0, 0), s) for s in (_SMOOTH, _BROAD))
+        return np.asarray(fine - broad)
 
     @cached_property
     def features(self) -> tuple[FloatArray, NDArray[np.float32]]:

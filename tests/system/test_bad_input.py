@@ -624,7 +624,8 @@ SYSTEM_MISTAKES = {
     "mistake in a nested system": append(
         '\n[component.nav]\ntype = "system"\nfile = "mount.toml"\n',
         "ConfigurationError: in 'nav' ({folder}/mount.toml): 'mount' has no parameter 'sigma'\n"
-        "  its parameters: misalignment, misalignment_sigma0, misalignment_walk, offset, period, rate, times",
+        "  its parameters: misalignment, misalignment_sigma0, misalignment_walk, offset, period, "
+        "rate, times",
     ),
     "records of one name through nesting": append(
         '\n[component.nav]\ntype = "system"\nfile = "recorded.toml"\n'
