@@ -12,7 +12,7 @@ from terrafix.components.matcher import AMPLITUDE
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component
 from terrafix.cosim.errors import ConfigurationError
-from terrafix.cosim.parameters import FilePath
+from terrafix.cosim.parameters import OptionalFilePath
 from terrafix.cosim.ports import Input, MessageInput, SharedInput
 
 _FIGURES = (".png", ".svg", ".pdf")
@@ -28,7 +28,7 @@ class ImageAlbum(Component):
 
     default_rate = Rate("0.2")
 
-    picture = FilePath(Path(), doc="file to draw to (.png, .svg or .pdf); none if not set")
+    picture = OptionalFilePath(doc="file to draw to (.png, .svg or .pdf); none if not set")
 
     images = SharedInput((None, None, None), dtype=np.float32, doc="amplitudes of the images")
     unfocused = SharedInput((None, None), dtype=np.float32, doc="the first one before autofocus")
@@ -43,13 +43,15 @@ class ImageAlbum(Component):
 
     def validate(self) -> None:
         """Look at the name of the file."""
-        path: Path = self.setting("picture")
-        if path != Path() and path.suffix.lower() not in _FIGURES:
+        path: Path | None = self.setting("picture")
+        if path is None:
+            return
+        if path.suffix.lower() not in _FIGURES:
             raise ConfigurationError(
                 f"'{self.name}.picture' is '{path}'; it takes a file that ends in "
                 f"{', '.join(_FIGURES)}"
             )
-        if path != Path() and not path.parent.is_dir():
+        if not path.parent.is_dir():
             raise ConfigurationError(
                 f"'{self.name}.picture' is '{path}', but there is no folder '{path.parent}'"
             )
@@ -80,7 +82,7 @@ class ImageAlbum(Component):
 
     def terminate(self) -> None:
         """Draw."""
-        if self.picture != Path() and self._page:
+        if self.picture is not None and self._page:
             self._draw(self.picture)
 
     def _draw(self, path: Path) -> None:

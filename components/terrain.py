@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from terrafix.components.fields import GRID_LABELS, GRID_UNITS, FloatArray
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component
 from terrafix.cosim.errors import ConfigurationError
-from terrafix.cosim.parameters import Choice, Count, FilePath, Flag, Parameter
+from terrafix.cosim.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
 from terrafix.cosim.ports import SharedOutput
 from terrafix.models.dem import Dem, flat_dem, read_dem, read_jacksboro
 from terrafix.models.scene import Scene
@@ -37,7 +36,7 @@ class Terrain(Component):
         "file",
         doc="file; jacksboro: the real one that comes with matplotlib; flat: one height",
     )
-    dem_file = FilePath(Path(), doc="tile of SRTM (.hgt) or arrays (.npz)")
+    dem_file = OptionalFilePath(doc="tile of SRTM (.hgt) or arrays (.npz)")
     flat_height = Parameter(0.0, unit="m", doc="height everywhere (flat); 0 is the sea")
     mirrored = Flag(False, doc="go on for ever in mirror images: artificial, without borders")
     fill_voids = Flag(False, doc="interpolate voids instead of refusing them")
@@ -60,7 +59,7 @@ class Terrain(Component):
         source, path = self.setting("source"), self.setting("dem_file")
         if source == "flat":
             return flat_dem(float(self.setting("flat_height")))
-        if source == "file" and path == Path():
+        if source == "file" and path is None:
             raise ConfigurationError(
                 f"'{self.name}' needs an elevation model\n"
                 f"  set {self.name}.dem_file, or {self.name}.source to jacksboro or flat"

@@ -8,7 +8,7 @@ from typing import Any
 from terrafix.cosim.component import Component
 from terrafix.cosim.errors import nearest
 from terrafix.cosim.loading import Load
-from terrafix.cosim.parameters import FilePath, shown
+from terrafix.cosim.parameters import PATHS, shown
 from terrafix.cosim.system import System
 
 TOP = ("schema", "name", "doc", "duration", "members", "seed")
@@ -92,7 +92,7 @@ def try_others(load: Load, system: System, others: list[Value]) -> None:
         setting = node.settings().get(name)
         if setting is None:
             refuse_parameter(load, node, name)
-        elif not isinstance(setting, FilePath):
+        elif not isinstance(setting, PATHS):
             load.attempt(setting.read, value, where=f"'{key}'", bare=False)
 
 

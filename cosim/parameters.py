@@ -328,6 +328,25 @@ class FilePath(Setting[Path]):
         return str(value)
 
 
+class OptionalFilePath(Setting[Path | None]):
+    """A file that need not be named: None unless it is."""
+
+    def __init__(self, *, doc: str = "") -> None:
+        super().__init__(None, doc=doc)
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> Path | None:
+        """Accept a path as `FilePath` does, or None."""
+        return None if value is None else FilePath().read(value, where=where, bare=bare)
+
+    def write(self, value: Path | None) -> str | None:
+        """Write the path as text, if there is one."""
+        return None if value is None else str(value)
+
+
+PATHS = (FilePath, OptionalFilePath)
+"""Settings whose relative paths begin at the system file."""
+
+
 def finite_float(value: object, where: str) -> float:
     """Read a finite number or raise ConfigurationError naming `where`."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):

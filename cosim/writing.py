@@ -10,7 +10,7 @@ from terrafix.cosim.clock import Rate, text_seconds
 from terrafix.cosim.dispersion import KINDS
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.files import SCHEMA
-from terrafix.cosim.parameters import FilePath
+from terrafix.cosim.parameters import PATHS
 from terrafix.cosim.registry import component_entries
 from terrafix.cosim.system import Record, System
 
@@ -63,7 +63,9 @@ def system_text(system: System) -> str:
         for name, setting in component.settings().items():
             if name in component._base:
                 value = component.setting(name)
-                if isinstance(setting, FilePath):  # the same file from any folder
+                if value is None:
+                    continue
+                if isinstance(setting, PATHS):  # the same file from any folder
                     value = value.absolute()
                 written = setting.write(value)
                 lines.append(f"{name} = {_toml(written)}")

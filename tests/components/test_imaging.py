@@ -76,7 +76,9 @@ def test_images_formed_with_the_estimate_become_fixes(flown):
     assert np.linalg.norm(before[0], axis=1).max() > 1000
     assert np.linalg.norm(before[-1], axis=1).max() < 500
     D = at_fix(flown, "matcher.fix.D")
-    assert np.linalg.eigvalsh(D) == pytest.approx(np.tile([0.16, 0.36, 6.25], (3, 1)), rel=1e-6)
+    assert np.linalg.eigvalsh(D) == pytest.approx(
+        np.tile([0.14**2, 0.22**2, 1.28**2], (3, 1)), rel=1e-6
+    )
 
 
 def test_range_noise_is_a_members_own_and_the_image_is_shared(flown):

@@ -76,9 +76,11 @@ SYSTEM_MISTAKES = {
         'type = "imu"',
         "type = 3",
         "ConfigurationError: 'imu' has the type 3, which is no name\n"
-        "  component types: antenna_mount, attitude_sensor, imu, last_known_state, lvlh_attitude, "
-        "mekf_correct, mekf_predict, navigation_evaluation, orbit, recorded_attitude, "
-        "recorded_imu, recorded_orbit, synthetic_sar_fix",
+        "  component types: antenna_mount, attitude_sensor, earlier_pass, image_album, "
+        "image_former, image_matcher, imu, last_known_state, lvlh_attitude, mekf_correct, "
+        "mekf_predict, navigation_evaluation, orbit, recorded_attitude, recorded_echo, "
+        "recorded_imu, recorded_orbit, recorded_reference, reference_file, scene_echo, "
+        "synthetic_sar_fix, terrain",
     ),
     "table that is misspelled": edit(
         "[component.orbit]",
@@ -100,8 +102,8 @@ SYSTEM_MISTAKES = {
         'speed_sigma = "0.54 m/s"',
         'beamwidth = "1 deg"',
         "ConfigurationError: 'sar' has no parameter 'beamwidth'\n"
-        "  its parameters: boresight, flattening, geolocation_bias, geolocation_sigma, look, "
-        "offset, period, radius, range_sigma, rate, speed_sigma, squint, times",
+        "  its parameters: boresight, flattening, geolocation_bias, geolocation_sigma, in_track, "
+        "look, offset, period, radius, range_sigma, rate, speed_sigma, squint, times",
     ),
     "misspelled parameter": edit(
         'gravity = "j2"',
