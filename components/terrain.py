@@ -108,7 +108,8 @@ class Terrain(Component):
 
 def dem_from(height: NDArray[np.float32], grid: FloatArray) -> Dem:
     """Elevation model of the ports of a terrain, without copying it."""
-    return Dem(height, *map(float, grid[:4]), mirrored=bool(grid[4]))
+    south, west, north, east, mirrored = (float(g) for g in grid)
+    return Dem(height, south, west, north, east, mirrored=bool(mirrored))
 
 
 def scene_from(height: NDArray[np.float32], grid: FloatArray, surface: FloatArray) -> Scene:

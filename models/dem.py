@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -246,7 +247,7 @@ def read_jacksboro() -> Dem:
     """
     from matplotlib import cbook
 
-    arrays = cbook.get_sample_data("jacksboro_fault_dem.npz")
+    arrays: Any = cbook.get_sample_data("jacksboro_fault_dem.npz")
     north, south = (float(arrays[k]) for k in ("ymin", "ymax"))
     south, north = min(south, north), max(south, north)
     height = np.ascontiguousarray(arrays["elevation"][::-1], dtype=np.float32)
@@ -290,7 +291,7 @@ def read_dem(path: Path) -> Dem:
         raise ValueError(f"'{path}' is no elevation model: a tile of SRTM (.hgt) or arrays (.npz)")
     arrays = read_arrays(path, KEYS, "an elevation model")
     try:
-        place = [float(np.radians(float(arrays[k]))) for k in KEYS[1:]]
-        return Dem(np.asarray(arrays["height_m"], np.float32), *place, name=path.name)
+        south, west, north, east = (float(np.radians(float(arrays[k]))) for k in KEYS[1:])
+        return Dem(np.asarray(arrays["height_m"], np.float32), south, west, north, east, path.name)
     except (TypeError, ValueError) as error:
         raise ValueError(f"'{path}': {error}") from error

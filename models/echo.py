@@ -120,13 +120,17 @@ class _Histories:
         x = np.concatenate(
             [SPEED_OF_LIGHT * edge / (radar.carrier + s * radar.sample_rate / 2) for s in (-1, 1)]
         )
-        self.domain = [float(x.min()), float(x.max())]
+        self.domain = (float(x.min()), float(x.max()))
         x = np.mean(self.domain) + np.ptp(self.domain) / 2 * chebyshev.chebpts1(2 * _DEGREE)
         self.g = [Chebyshev.fit(x, _legendre(x, c), _DEGREE, domain=self.domain) for c in rates]
         inverse = np.linalg.inv(chebyshev.chebvander(chebyshev.chebpts1(5), 4))
         self.coefficients = np.tensordot(inverse, np.stack([g.coef for g in self.g]), 1)
         middle = chebyshev.chebvander(np.zeros(1), 4)[0] @ self.coefficients
         self.middle = Chebyshev(middle, domain=self.domain)
+
+    def clipped(self, x: FloatArray) -> FloatArray:
+        """Hold x within where g is known."""
+        return np.asarray(np.clip(x, self.domain[0], self.domain[1]), np.float64)
 
     def at(self, x: FloatArray) -> FloatArray:
         """Coefficients (len(x), 5) of g at x as a polynomial of range."""
@@ -423,12 +427,12 @@ def received(
     beam = np.sinc(acquisition.antenna_length * (frequency - acquisition.centroid) / (2 * speed))
     weight = beam**2 * radar.prf / np.sqrt(rate)
     cells = np.arange(n_cells)
-    ranges = footprint.near_range + cells * radar.range_spacing
+    ranges = np.asarray(footprint.near_range + cells * radar.range_spacing, np.float64)
     by_range = chebyshev.chebvander(_scaled_to(ranges, middle.span), 4).T
     scale = 2 / radar.wavelength
 
     def compress_inversely(rows: slice) -> None:
-        x = np.clip(radar.wavelength * frequency[rows], *middle.domain)
+        x = middle.clipped(radar.wavelength * frequency[rows])
         low, high = (
             spectra[k][rows] * unit_phasor(scale * (histories[k].at(x) @ by_range)) for k in (0, 1)
         )
@@ -472,7 +476,7 @@ def _migrate(
     radar: Radar,
 ) -> None:
     """Move ranges other than the middle one by what their migration differs from its."""
-    x = np.clip(radar.wavelength * frequency, *history.domain)
+    x = history.clipped(radar.wavelength * frequency)
     ends = [-g(x) + x * g.deriv()(x) for g in (history.g[0], history.g[-1])]
     stretch = (ends[1] - ends[0]) / (history.ranges[-1] - history.ranges[0])
     offset = ranges - np.mean(history.span)

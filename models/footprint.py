@@ -9,6 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.polynomial import chebyshev
+from numpy.typing import ArrayLike
 
 from terrafix.models.arc import OrbitArc
 from terrafix.models.chirp import Radar
@@ -62,7 +63,7 @@ class Footprint:
             self.near_range + (self.n_cells - 1) / 2 * self.radar.range_spacing,
         )
 
-    def points(self, t: FloatArray, slant_range: FloatArray, height: FloatArray) -> FloatArray:
+    def points(self, t: ArrayLike, slant_range: ArrayLike, height: ArrayLike) -> FloatArray:
         """Earth-fixed points (..., 3) [m] seen at times [s] and ranges [m], at heights [m]."""
         r, v = self.arc.position(t), self.arc.velocity(t)
         sine = self.radar.wavelength * self.centroid / (2 * np.linalg.norm(v, axis=-1))
@@ -100,8 +101,9 @@ class TerrainGrid:
             for n, s in zip((footprint.n_lines, footprint.n_cells), _COARSE, strict=True)
         )
         radar = footprint.radar
-        t = footprint.first_time + _COARSE[0] * np.arange(n_i) / radar.prf
-        R = footprint.near_range + _COARSE[1] * np.arange(n_j) * radar.range_spacing
+        lines, cells = _COARSE[0] * np.arange(n_i), _COARSE[1] * np.arange(n_j)
+        t: FloatArray = np.asarray(footprint.first_time + lines / radar.prf, np.float64)
+        R: FloatArray = np.asarray(footprint.near_range + cells * radar.range_spacing, np.float64)
         surface = _Surface(footprint, t[[0, -1]], R[[0, -1]], scene)
         self.latitude, self.longitude, self.height = surface.on(t, R)
         self.power_db = self._power_db(scene, t)

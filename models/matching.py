@@ -163,7 +163,8 @@ class Searchable:
         blurred = cv2.GaussianBlur(self.nepers, (0, 0), _BLUR)
         low, high = np.percentile(blurred, [0.5, 99.5])
         gray = np.clip((blurred - low) * (255 / max(float(high - low), 1e-6)), 0, 255)
-        sift = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=0.01)
+        opencv: Any = cv2  # its stubs lack some of what it has
+        sift = opencv.SIFT_create(nfeatures=_FEATURES, contrastThreshold=0.01)
         points, descriptors = sift.detectAndCompute(gray.astype(np.uint8), None)
         if descriptors is None:
             return np.empty((0, 4)), np.empty((0, 128), np.float32)
@@ -305,7 +306,8 @@ def _aligned(
     xy = np.ascontiguousarray(transform[::-1][:, [1, 0, 2]], np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ROUNDS, _CLOSE)
     try:
-        correlation, found = cv2.findTransformECC(
+        opencv: Any = cv2
+        correlation, found = opencv.findTransformECC(
             image.smooth, reference.smooth, xy, cv2.MOTION_AFFINE, criteria, None, 1
         )
     except cv2.error:  # it raises where the images do not overlap or do not correlate

@@ -36,7 +36,7 @@ def detected(image: ComplexArray, looks: tuple[int, int]) -> Single:
     part = image[: shape[0] * looks[0], : shape[1] * looks[1]]
     power = part.real**2 + part.imag**2
     power = power.reshape(shape[0], looks[0], shape[1], looks[1]).mean(axis=(1, 3))
-    return np.sqrt(power, dtype=np.float32)
+    return np.asarray(np.sqrt(power), np.float32)
 
 
 def full_index(pixel: ArrayLike, n: int) -> FloatArray:

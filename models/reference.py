@@ -20,7 +20,7 @@ from terrafix.models.footprint import Footprint, TerrainGrid
 from terrafix.models.geolocation import Height, geodetic, ground_point_on_terrain
 from terrafix.models.model import FloatArray
 from terrafix.models.multilook import detected, full_index, multilook_index
-from terrafix.models.scene import Scene
+from terrafix.models.scene import Scene, Single
 
 KEYS = ("amplitude", "rows", "columns", "latitude_deg", "longitude_deg", "height_m")
 
@@ -43,7 +43,7 @@ class Reference:
         If shapes do not fit, or something is not finite.
     """
 
-    amplitude: FloatArray
+    amplitude: Single
     rows: FloatArray
     columns: FloatArray
     latitude: FloatArray
