@@ -8,11 +8,13 @@ OUT := .demo
 
 .PHONY: demo test quick lint types campaigns benchmarks clean
 
-## the main job: a spacecraft that has lost GPS finds itself again (100 members, table and picture)
+## the main job: a spacecraft that has lost GPS finds itself in images formed with its own estimate
 demo: $(RUN)
 	@mkdir -p $(OUT)
-	$(BIN)/terrafix run examples/spacecraft_sar_open_loop.toml \
-	    --out $(OUT)/open_loop.nc --plot $(OUT)/open_loop.png
+	$(BIN)/terrafix run examples/spacecraft_sar_closed_loop.toml \
+	    --set album.picture=$(CURDIR)/$(OUT)/closed_loop.png \
+	    --out $(OUT)/closed_loop.nc --plot $(OUT)/errors.png
+	@echo wrote $(OUT)/closed_loop.png
 
 ## all tests, with lint and types
 test: $(STAMP) lint types
@@ -39,6 +41,10 @@ campaigns: $(STAMP)
 ## the promised numbers, as ratios against a reference in the same run
 benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/run.py
+	$(BIN)/python benchmarks/imaging.py
+	$(BIN)/python benchmarks/closed_loop.py
+	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
+	    then $(BIN)/python benchmarks/real_echo.py; fi
 
 $(RUN): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -152,11 +152,12 @@ def fixes(closed: list[dict[str, Any]]) -> None:
             f"{np.sqrt(np.mean(e**2)):.2f} m, largest {np.abs(e).max():.2f} m"
         )
     print("  covariance [m^2]", np.round(np.cov(errors.T), 2).tolist())
-    V = np.array([s["velocity"][k, 0] for s in closed for k in range(3)])
-    V = V[np.isfinite(V)]
+    starts = np.concatenate([s["velocity"].ravel() for s in closed])
+    V, share = starts[np.isfinite(starts)], 100 * np.mean(np.abs(starts) < 1.5)
     print(
-        f"  effective velocity: {len(V)} focused, mean {V.mean():.3f}, rms "
-        f"{np.sqrt(np.mean(V**2)):.3f}, largest {np.abs(V).max():.2f} m/s"
+        f"  autofocus: {len(starts)} starts, {share:.1f} % within "
+        f"1.5 m/s, mean {V.mean():.3f}, rms {np.sqrt(np.mean(V**2)):.3f}, "
+        f"largest {np.abs(V).max():.2f}"
     )
 
 

@@ -1,0 +1,178 @@
+"""Speed of the imaging chain, and autofocus and matching on recorded echo.
+
+    python benchmarks/imaging.py [--starts 100] [--places 100] [--seeds 1]
+
+Autofocus and matching need the recording (TERRAFIX_DATA); without it they are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import cv2
+import numpy as np
+from scipy import fft
+
+from terrafix.models.autofocus import SharpnessCurve, autofocus
+from terrafix.models.chirp import Radar
+from terrafix.models.doppler import fractional_centroid, unwrapped_centroid
+from terrafix.models.focusing import RangeDoppler, azimuth_compressed, azimuth_looks, range_doppler
+from terrafix.models.matching import Searchable, matched
+from terrafix.models.recording import read_recording
+
+ROOT = Path(__file__).parents[1]
+DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT / ".." / "shared" / "data"))
+RADARSAT = Radar(5.3e9, 1256.98, 32.317e6, -0.72135e12, 41.75e-6, 0.75 * 1256.98)
+CHUNKS = ("airport", "stanley_park", "ubc", "english_bay_1", "english_bay_2")
+SIZE = 256  # [pixels] of a chip
+
+
+def seconds(action: Callable[[], object], repeat: int = 5) -> float:
+    found = []
+    for _ in range(repeat):
+        started = time.perf_counter()
+        action()
+        found.append(time.perf_counter() - started)
+    return median(found)
+
+
+def speckle(shape: tuple[int, int], seed: int = 0) -> np.ndarray:
+    pairs = np.random.default_rng(seed).standard_normal((*shape, 2), np.float32)
+    return pairs.view(np.complex64)[..., 0]
+
+
+def speed() -> None:
+    """Against the two transforms and back that any processor in frequency needs."""
+    echo = speckle((1536, 2048))
+    floor = seconds(lambda: fft.ifft2(fft.fft2(echo, workers=-1), workers=-1))
+
+    def processed() -> None:
+        domain = range_doppler(
+            echo, RADARSAT, near_range=988647.0, centroid=-7000.0, velocity=7062.0
+        )
+        azimuth_compressed(domain, 7062.0)
+
+    whole = seconds(processed)
+    print(
+        f"range-Doppler processor, 1536 x 2048: {whole:.2f} s (< 1), {whole / floor:.1f} x its FFTs"
+    )
+    small = Radar(5.3e9, 1256.98, 32.317e6, -0.72135e12, 1e-6, 0.75 * 1256.98)
+    domain = range_doppler(
+        speckle((1024, 1024)), small, near_range=988647.0, centroid=0.0, velocity=7062.0
+    )
+    curve = SharpnessCurve(domain, 1.0)
+    offsets = iter(range(1000))
+    one = seconds(lambda: curve.at(7062 + next(offsets)))
+    floor = seconds(lambda: fft.ifft(domain.spectrum, axis=0, workers=-1))
+    print(f"autofocus candidate, 1024 x 1024: {one:.3f} s (< 0.15), {one / floor:.1f} x its FFT")
+
+
+def domain_of(name: str) -> RangeDoppler:
+    lines = read_recording(DATA / "radarsat1_vancouver" / f"{name}.npz")
+    near = 988647.462 + (lines.first_cell - 1) * RADARSAT.range_spacing
+    fraction, _ = fractional_centroid(lines.echo, RADARSAT.prf)
+    centroid = unwrapped_centroid(fraction, RADARSAT.prf, -6900.0)
+    return range_doppler(
+        lines.echo, RADARSAT, near_range=near, centroid=centroid, velocity=7062.0
+    ).cropped()
+
+
+def focusing(domains: dict[str, RangeDoppler], starts: int) -> None:
+    print(f"autofocus, {starts} starts within +-50 m/s of 7062")
+    for k, (name, domain) in enumerate(domains.items()):
+        rng = np.random.default_rng([1, k])
+        curve = SharpnessCurve(domain, 2.0)
+        found = [autofocus(curve, 7062 + x) for x in rng.uniform(-50, 50, starts)]
+        V = np.array([f.velocity for f in found if f.accepted])
+        far = np.abs(V - 7062).max() if len(V) else np.nan
+        print(
+            f"  {name:14s} {100 * len(V) / starts:5.0f} % accepted, {V.min():.1f} to "
+            f"{V.max():.1f}, furthest {far:.1f} m/s"
+        )
+    refused = []
+    for seed in range(20):
+        echo = speckle((1536, 2048), seed)
+        domain = range_doppler(
+            echo, RADARSAT, near_range=988647.0, centroid=-7000.0, velocity=7062.0
+        ).cropped()
+        curve = SharpnessCurve(domain, 2.0)
+        rng = np.random.default_rng([2, seed])
+        refused += [not autofocus(curve, 7062 + x).accepted for x in rng.uniform(-50, 50, 5)]
+    print(f"  speckle        {100 * np.mean(refused):5.0f} % refused, of {len(refused)}")
+
+
+def chip(amplitude: np.ndarray, rng: np.random.Generator) -> tuple[Searchable, np.ndarray]:
+    half = SIZE / np.sqrt(2) + 2
+    center = np.array([rng.uniform(half, n - 1 - half) for n in amplitude.shape])
+    M = cv2.getRotationMatrix2D((center[1], center[0]), rng.uniform(-12, 12), 1.0)
+    M[:, 2] += (SIZE - 1) / 2 - center[::-1]
+    return Searchable(cv2.warpAffine(amplitude, M, (SIZE, SIZE), flags=cv2.INTER_LINEAR)), center
+
+
+def matching(domains: dict[str, RangeDoppler], places: int, seed: int) -> None:
+    looks = {}
+    for name, domain in domains.items():
+        velocity = autofocus(SharpnessCurve(domain, 2.0), 7062.0).velocity
+        looks[name] = [np.abs(i.valid) for i in azimuth_looks(domain, velocity, 2)]
+    references = {n: Searchable(b) for n, (_, b) in looks.items()}
+    print(f"matching of two looks, {places} places, turned up to 12 degrees, seed {seed}")
+    n_accepted = n_far = 0
+    for k, (name, (one, _)) in enumerate(looks.items()):
+        inner = one[60:-60, 40:-40]
+        whole = matched(Searchable(inner), references[name])
+        offset = np.zeros(2)
+        if whole.accepted:
+            middle = [60 + (inner.shape[0] - 1) / 2, 40 + (inner.shape[1] - 1) / 2]
+            offset = np.array([whole.row, whole.column]) - middle
+        rng = np.random.default_rng([seed, k])
+        errors = []
+        started = time.perf_counter()
+        for _ in range(places):
+            image, center = chip(one, rng)
+            match = matched(image, references[name])
+            if match.accepted:
+                errors.append([match.row, match.column] - center - offset)
+        wall = (time.perf_counter() - started) / places
+        distance = np.linalg.norm(np.reshape(errors, (-1, 2)), axis=1)
+        good = distance[distance < 1.5]
+        n_accepted, n_far = n_accepted + len(distance), n_far + int(np.sum(distance > 3))
+        rms = np.sqrt(np.mean(good**2)) if len(good) else np.nan
+        print(
+            f"  {name:14s} looks apart by {offset[0]:5.2f}, {offset[1]:5.2f}; "
+            f"{100 * len(distance) / places:3.0f} % accepted, {100 * len(good) / places:3.0f} % "
+            f"within 1.5 pixels, rms {rms:.2f}, {wall:.2f} s each"
+        )
+    print(f"  all: {n_far} of {n_accepted} accepted further than 3 pixels")
+    rng = np.random.default_rng([seed, 99])
+    together = {"stanley_park", "ubc", "english_bay_1"}  # they overlap
+    n = wrong = 0
+    for name, (one, _) in looks.items():
+        for other, reference in references.items():
+            mirrored = Searchable(np.ascontiguousarray(reference.amplitude[:, ::-1]))
+            alike = name == other or {name, other} <= together
+            for against in [mirrored] if alike else [mirrored, reference]:
+                for _ in range(max(1, places // 20)):
+                    n += 1
+                    wrong += matched(chip(one, rng)[0], against).accepted
+    print(f"  against wrong places and mirror images: {wrong} of {n} accepted")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--starts", type=int, default=100)
+    parser.add_argument("--places", type=int, default=100)
+    parser.add_argument("--seeds", type=int, default=1)
+    arguments = parser.parse_args()
+    speed()
+    if (DATA / "radarsat1_vancouver").is_dir():
+        chunks = {name: domain_of(name) for name in CHUNKS}
+        focusing(chunks, arguments.starts)
+        for number in range(arguments.seeds):
+            matching(chunks, arguments.places, number)
+    else:
+        print(f"no recording in {DATA}: set TERRAFIX_DATA")
