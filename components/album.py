@@ -12,7 +12,7 @@ from terrafix.components.matcher import AMPLITUDE
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component
 from terrafix.cosim.errors import ConfigurationError
-from terrafix.cosim.parameters import OptionalFilePath
+from terrafix.cosim.parameters import Count, OptionalFilePath
 from terrafix.cosim.ports import Input, MessageInput, SharedInput
 
 _FIGURES = (".png", ".svg", ".pdf")
@@ -29,6 +29,8 @@ class ImageAlbum(Component):
     default_rate = Rate("0.2")
 
     picture = OptionalFilePath(doc="file to draw to (.png, .svg or .pdf); none if not set")
+
+    detail = Count(4, minimum=1, doc="part of its rows and columns in which blur is shown; 1: all")
 
     images = SharedInput((None, None, None), dtype=np.float32, doc="amplitudes of the images")
     unfocused = SharedInput((None, None), dtype=np.float32, doc="the first one before autofocus")
@@ -120,11 +122,12 @@ class ImageAlbum(Component):
     def _draw_images(self, panels: Any) -> None:
         page = self._page
         titles = (
-            f"the image at {page['t']:g} s, formed with the estimate",
+            f"{'a detail' if self.detail > 1 else 'the image'} at {page['t']:g} s, as estimated",
             "the same, autofocused",
             f"recognized on the reference: {len(page['inliers'])} features",
         )
-        shown = (page["unfocused"], page["focused"], page["reference"])
+        detail = _about_the_brightest(page["focused"], self.detail)
+        shown = (page["unfocused"][detail], page["focused"][detail], page["reference"])
         limits = np.percentile(_decibels(page["focused"]), [3, 99.7])
         for panel, image, title in zip(panels, shown, titles, strict=True):
             own = (
@@ -159,6 +162,17 @@ class ImageAlbum(Component):
     def _set_extra_state(self, saved: dict[str, Any]) -> None:
         self._history = list(np.asarray(saved["history"]))
         self._page = {k.removeprefix("page."): v for k, v in saved.items() if k.startswith("page.")}
+
+
+def _about_the_brightest(image: FloatArray, part: int) -> tuple[slice, slice]:
+    """A part of the rows and columns, about the brightest pixel: there blur is seen."""
+    found = np.unravel_index(int(np.argmax(image)), image.shape)
+    slices = []
+    for middle, n in zip(found, image.shape, strict=True):
+        size = max(n // part, 1)
+        start = int(np.clip(int(middle) - size // 2, 0, n - size))
+        slices.append(slice(start, start + size))
+    return slices[0], slices[1]
 
 
 def _decibels(amplitude: FloatArray) -> FloatArray:
