@@ -391,3 +391,26 @@ def test_a_known_misalignment_stays_known(case, update):
 def test_unknown_update_is_refused():
     with pytest.raises(ValueError, match=r"update must be one of .*got 'ukf'"):
         mekf_correct_model("ukf")
+
+
+def test_a_fix_of_another_instant_is_refused(case):
+    """Ten milliseconds are seventy meters."""
+    values, _ = case
+    late = correct("ekf", values, fix_t=8.2, time=8.21)
+    assert late["posterior.valid"] == 0
+    assert reason(late) == "not of this instant"
+    np.testing.assert_array_equal(late["estimate.r_e"], values["prior_r_e"])
+    timely = correct("ekf", values, fix_t=8.2, time=8.2)
+    assert reason(timely) == "accepted"
+
+
+@EVERY
+def test_a_fix_may_measure_the_effective_velocity(case, update):
+    """The same truth, prior and errors: both kinds are accepted and know the speed alike."""
+    values, _ = case
+    effective = synthetic_fix_model(in_track="effective")
+    assert effective.name == synthetic_fix_model().name
+    by_speed = correct(update, values)
+    wrong, _ = mekf_correct_model(update, "effective").advance(**values)
+    assert wrong["innovation.nis"] > 1e4  # a speed that is taken for an effective velocity
+    assert by_speed["innovation.nis"] < 30

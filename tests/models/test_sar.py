@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from terrafix.models.earth import EARTH
 from terrafix.models.geodesy import geodetic_from_ecef_array
+from terrafix.models.geolocation import ecef
 from terrafix.models.quaternion import (
     angle_between_array,
     from_rotation_vector_array,
@@ -93,6 +94,32 @@ def test_jacobians_agree_with_central_differences(check_jacobian, values):
     check_jacobian(MODEL, "y", "r_f_e", 10.0, **values)
     check_jacobian(MODEL, "y", "v_e", 1.0, **values)
     check_jacobian(MODEL, "y", "dmu", 1e-4, **values)
+
+
+def test_the_effective_velocity_depends_on_position_and_its_derivative_says_so(
+    check_jacobian, start_e
+):
+    """1 km moves the speed it implies by 0.14, 0.37 and -0.20 m/s; the speed itself by nothing."""
+    r_e, v_e, q_be = start_e
+    model = sar_measurement_model("effective")
+    values = {
+        "r_e": r_e,
+        "v_e": v_e,
+        "q_mu": np.array([0.0, 0.0, 0.0, 1.0]),
+        "dmu": np.zeros(3),
+        "q_be": q_be,
+        "q_sb": q_sb(LOOK, 0.0),
+        "r_f_e": ecef(np.radians(29.76), np.radians(-95.37), 0.0),
+    }
+    for wrt, step in (("r_e", 100.0), ("v_e", 1.0), ("r_f_e", 100.0)):
+        check_jacobian(model, "y", wrt, step, **values)
+    y = model(**values)["y"]
+    assert y[3] == pytest.approx(7188.5, abs=0.6)
+    by_speed = model.jacobian("y", "v_e", **values)[3] @ v_e / np.linalg.norm(v_e)
+    by_position = model.jacobian("y", "r_e", **values)[3]
+    assert -1e3 * by_position / by_speed == pytest.approx([0.14, 0.37, -0.20], abs=0.02)
+    others = MODEL(**values)["y"]
+    assert y[:3] == pytest.approx(others[:3])
 
 
 @given(states(), vectors)
@@ -212,3 +239,8 @@ def test_mount_draws_and_walks_from_the_left():
 def test_unknown_boresight_is_refused():
     with pytest.raises(ValueError, match=r"boresight must be one of .*got 'left'"):
         synthetic_fix_model("left")
+
+
+def test_an_unknown_element_is_refused():
+    with pytest.raises(ValueError, match=r"in_track must be one of .*got 'ground'"):
+        sar_measurement_model("ground")
