@@ -29,8 +29,8 @@ from terrafix.models.recording import RecordedLines, read_recording
 
 RADAR: dict[str, Any] = {"shape": (6,), "unit": RADAR_UNITS, "labels": RADAR_LABELS}
 ECHO: dict[str, Any] = {"shape": (None, None), "dtype": np.complex64}
-_SPARE = 0.2
-"""Arc beyond what is received, in parts of it."""
+_BEYOND = 5.0
+"""Arc beyond all apertures [s]: the corners of the surface that is looked up are seen that late."""
 
 
 class _Echo(Component):
@@ -143,8 +143,10 @@ class SceneEcho(_Echo):
         n_lines, n_cells = self.n_lines, self.n_cells
         first_time = t - (n_lines - 1) / 2 / radar.prf
         near = beam.slant_range - (n_cells - radar.n_pulse) / 2 * radar.range_spacing
-        reach = n_lines / radar.prf + 2 * radar.doppler_bandwidth / 100
-        arc = OrbitArc(common(self, "r_e"), common(self, "v_e"), t, reach, reach)
+        r_e, v_e = common(self, "r_e"), common(self, "v_e")
+        aperture = radar.prf * radar.wavelength * beam.slant_range / (2 * (v_e @ v_e))
+        reach = n_lines / radar.prf + aperture + _BEYOND
+        arc = OrbitArc(r_e, v_e, t, reach, reach)
         try:
             acquisition = Acquisition(
                 radar,
