@@ -144,7 +144,8 @@ class SceneEcho(_Echo):
         first_time = t - (n_lines - 1) / 2 / radar.prf
         near = beam.slant_range - (n_cells - radar.n_pulse) / 2 * radar.range_spacing
         r_e, v_e = common(self, "r_e"), common(self, "v_e")
-        aperture = radar.prf * radar.wavelength * beam.slant_range / (2 * (v_e @ v_e))
+        speed2 = float(v_e @ v_e)
+        aperture = radar.prf * radar.wavelength * beam.slant_range / (2 * speed2)
         reach = n_lines / radar.prf + aperture + _BEYOND
         arc = OrbitArc(r_e, v_e, t, reach, reach)
         try:

@@ -33,23 +33,21 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import factorial
 
 import numpy as np
-from numpy.polynomial import Chebyshev, chebyshev
+from numpy.polynomial import chebyshev
 from scipy import fft
 
 from terrafix.models.arc import OrbitArc
 from terrafix.models.chirp import SPEED_OF_LIGHT, ComplexArray, Radar, chirp_replica, unit_phasor
-from terrafix.models.focusing import stretched
 from terrafix.models.footprint import Footprint, TerrainGrid
 from terrafix.models.geolocation import ecef
+from terrafix.models.history import RangeHistories, range_derivatives
 from terrafix.models.model import FloatArray
 from terrafix.models.parallel import batches, over
+from terrafix.models.resampling import stretched
 from terrafix.models.scene import Scene
 
-_DEGREE = 8
-"""Of g as a polynomial: its error is below 1e-6 cycles over apertures of seconds."""
 _TAPS = 12
 
 
@@ -103,66 +101,6 @@ class Acquisition:
                 f"an illuminated band of {self.illuminated:.6g} Hz is not within the repetition "
                 f"frequency, {self.radar.prf:.6g} Hz"
             )
-
-
-class _Histories:
-    """The functions g of the module's equation, over a footprint's ranges at one height."""
-
-    def __init__(self, footprint: Footprint, height: float, illuminated: float) -> None:
-        radar, arc = footprint.radar, footprint.arc
-        t_b, _ = footprint.middle
-        far = footprint.near_range + (footprint.n_cells - 1) * radar.range_spacing
-        self.span = np.array([footprint.near_range, far])
-        self.ranges = np.mean(self.span) + np.ptp(self.span) / 2 * chebyshev.chebpts1(5)
-        p = footprint.points(np.full(5, t_b), self.ranges, np.full(5, height))
-        rates = range_derivatives(arc, t_b, p)
-        edge = np.array([-0.5, 0.5]) * (illuminated * 1.001) + footprint.centroid
-        x = np.concatenate(
-            [SPEED_OF_LIGHT * edge / (radar.carrier + s * radar.sample_rate / 2) for s in (-1, 1)]
-        )
-        self.domain = (float(x.min()), float(x.max()))
-        x = np.mean(self.domain) + np.ptp(self.domain) / 2 * chebyshev.chebpts1(2 * _DEGREE)
-        self.g = [Chebyshev.fit(x, _legendre(x, c), _DEGREE, domain=self.domain) for c in rates]
-        inverse = np.linalg.inv(chebyshev.chebvander(chebyshev.chebpts1(5), 4))
-        self.coefficients = np.tensordot(inverse, np.stack([g.coef for g in self.g]), 1)
-        middle = chebyshev.chebvander(np.zeros(1), 4)[0] @ self.coefficients
-        self.middle = Chebyshev(middle, domain=self.domain)
-
-    def clipped(self, x: FloatArray) -> FloatArray:
-        """Hold x within where g is known."""
-        return np.asarray(np.clip(x, self.domain[0], self.domain[1]), np.float64)
-
-    def at(self, x: FloatArray) -> FloatArray:
-        """Coefficients (len(x), 5) of g at x as a polynomial of range."""
-        scaled = (x - np.mean(self.domain)) / (np.ptp(self.domain) / 2)
-        return np.asarray(chebyshev.chebvander(scaled, _DEGREE) @ self.coefficients.T)
-
-
-def range_derivatives(arc: OrbitArc, t: float, p: FloatArray) -> FloatArray:
-    """First to fourth derivatives (n, 4) of the range to points (n, 3) at a time [m/s^k]."""
-    r, v, a, j, s = (arc.derivative(t, k) for k in range(5))
-    d = r - p
-    R = np.linalg.norm(d, axis=-1)
-    # derivatives of R^2 / 2, then of R
-    one = d @ v
-    two = v @ v + d @ a
-    three = 3 * (v @ a) + d @ j
-    four = 3 * (a @ a) + 4 * (v @ j) + d @ s
-    r1 = one / R
-    r2 = (two - r1**2) / R
-    r3 = (three - 3 * r1 * r2) / R
-    r4 = (four - 3 * r2**2 - 4 * r1 * r3) / R
-    return np.stack([r1, r2, r3, r4], axis=-1)
-
-
-def _legendre(x: FloatArray, rates: FloatArray) -> FloatArray:
-    """Evaluate g at x, for a range history with given derivatives."""
-    history = np.polynomial.Polynomial([0.0, *(c / factorial(k + 1) for k, c in enumerate(rates))])
-    speed, change = history.deriv(1), history.deriv(2)
-    s = (-x / 2 - rates[0]) / rates[1]
-    for _ in range(20):
-        s = s - (speed(s) + x / 2) / change(s)
-    return np.asarray(-history(s) - x * s / 2)
 
 
 def simulated_echo(
@@ -416,7 +354,7 @@ def received(
     frequency = fft.fftfreq(n_lines, 1 / radar.prf)
     frequency += radar.prf * np.rint((acquisition.centroid - frequency) / radar.prf)
     lit = np.abs(frequency - acquisition.centroid) <= acquisition.illuminated / 2
-    histories = [_Histories(footprint, h, acquisition.illuminated) for h in heights]
+    histories = [RangeHistories(footprint, h, acquisition.illuminated) for h in heights]
     middle = histories[0]
     # rows that are not lit are zero; the sums of the layers go where the first one was
     spectra = [fft.fft(layer, axis=0, overwrite_x=True, workers=-1) for layer in layers]
@@ -471,7 +409,7 @@ def _migrate(
     spectrum: ComplexArray,
     frequency: FloatArray,
     lit: FloatArray,
-    history: _Histories,
+    history: RangeHistories,
     ranges: FloatArray,
     radar: Radar,
 ) -> None:
