@@ -33,7 +33,24 @@ _DEGREE = 8
 
 
 class RangeHistories:
-    """The functions g of the module's equation, over a footprint's ranges at one height."""
+    """The functions g of the module's equation, over a footprint's ranges at one height.
+
+    Parameters
+    ----------
+    footprint : Footprint
+        Grid; its middle line gives the time of the derivatives.
+    height : float
+        Of all places [m].
+    illuminated : float
+        Doppler bandwidth over which g must hold [Hz].
+
+    Attributes
+    ----------
+    span : ndarray, shape (2,)
+        First and last range of the grid [m].
+    middle : Chebyshev
+        The function g of the range in the middle [m], of x [m/s].
+    """
 
     def __init__(self, footprint: Footprint, height: float, illuminated: float) -> None:
         radar, arc = footprint.radar, footprint.arc
