@@ -276,8 +276,8 @@ def test_bad_reference_files_are_refused_before_it_starts(tmp_path):
     assert "'reference' has no file" in failure(system)
 
 
-def recorded(folder, **change):
-    """The real-echo system with a small recording in place of the real one."""
+def recorded(folder, files="one.npz one.npz one.npz", **change):
+    """How to build the real-echo system with a small recording in place of the real one."""
     rng = np.random.default_rng(0)
     arrays = {
         "i": rng.integers(1, 15, (1536, 2048)).astype(np.int8),
@@ -286,16 +286,17 @@ def recorded(folder, **change):
         "first_rg_cell": np.array(1060),
     } | change
     np.savez(folder / "one.npz", **{k: v for k, v in arrays.items() if v is not None})
-    system = System.from_file(EXAMPLES / "spacecraft_sar_real_echo.toml")
-    for name in ("echo", "reference"):
-        system.nodes[name].folder = folder
-        system.nodes[name].files = "one.npz one.npz one.npz"
-    return system
+    settings = [
+        (f"{name}.{key}", value)
+        for name in ("echo", "reference")
+        for key, value in (("folder", str(folder)), ("files", files))
+    ]
+    return lambda: System.from_file(EXAMPLES / "spacecraft_sar_real_echo.toml", settings)
 
 
-def refusal(system, duration="5"):
+def refusal(make, duration="5"):
     with pytest.raises((SystemCheckError, ConfigurationError, RunError)) as raised:
-        simulate(system, duration=duration)
+        simulate(make(), duration=duration)
     return str(raised.value)
 
 
@@ -330,9 +331,7 @@ def test_a_recording_of_another_time_is_refused(tmp_path):
 
 
 def test_too_few_files_are_refused(tmp_path):
-    system = recorded(tmp_path)
-    system.nodes["echo"].files = "one.npz"
-    text = refusal(system, duration="10")
+    text = refusal(recorded(tmp_path, files="one.npz"), duration="10")
     assert "'echo' steps 3 times within 10 s, but has 1 file" in text
 
 
@@ -347,7 +346,7 @@ def test_a_recording_of_speckle_is_not_believed(tmp_path):
     rng = np.random.default_rng(1)
     i, q = rng.normal(0, 5, (2, 1536, 2048)).round().astype(np.int8)
     i[i == 0] = 1
-    result = simulate(recorded(tmp_path, i=i, q=q), members=1, duration="5")
+    result = simulate(recorded(tmp_path, i=i, q=q)(), members=1, duration="5")
     assert result.status == "complete"
     data = result.dataset
     values = data["matcher.reason"]
