@@ -174,7 +174,11 @@ def test_ctrl_c_keeps_what_was_recorded(tmp_path):
     out = tmp_path / "run.nc"
     command = [sys.executable, "-m", "terrafix", "run", str(ORBIT), "--out", str(out)]
     process = subprocess.Popen(
-        [*command, "--duration", "100000000"], stderr=subprocess.PIPE, text=True
+        [*command, "--duration", "100000000"],
+        stderr=subprocess.PIPE,
+        text=True,
+        # whoever started the tests in the background has it ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     deadline = time.monotonic() + 60
     while not (tmp_path / "run.nc.parts" / "manifest.json").exists():
