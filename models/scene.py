@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from terrafix.models.dem import Dem
 from terrafix.models.model import FloatArray
+from terrafix.models.parallel import batches, over
 
 CELL = float(np.radians(1e-4))
 """Spacing of the texture in latitude and longitude [rad], some 11 m."""
@@ -80,14 +81,22 @@ class Scene:
         fine *= np.float32(self.fine_db)
         # whole coarse cells that cover the rectangle
         ci, cj = (range(r.start // _COARSE - 2, r.stop // _COARSE + 4) for r in (rows, columns))
-        for name, sigma, scale in (
-            ("parcels a", _PARCEL, self.parcels_db / np.sqrt(2)),
-            ("parcels b", _PARCEL, self.parcels_db / np.sqrt(2)),
-            ("smooth", _SMOOTH, self.smooth_db),
-        ):
-            coarse = _smoothed_noise(self.seed, name, ci, cj, sigma)
-            field = _enlarged(coarse, ci, cj, rows, columns)
-            fine += np.float32(scale) * (np.sign(field) if name != "smooth" else field)
+        coarse = [
+            (name, scale, _smoothed_noise(self.seed, name, ci, cj, sigma))
+            for name, sigma, scale in (
+                ("parcels a", _PARCEL, self.parcels_db / np.sqrt(2)),
+                ("parcels b", _PARCEL, self.parcels_db / np.sqrt(2)),
+                ("smooth", _SMOOTH, self.smooth_db),
+            )
+        ]
+
+        def add(part: slice) -> None:
+            own = range(rows.start + part.start, rows.start + part.stop)
+            for name, scale, values in coarse:
+                field = _enlarged(values, ci, cj, own, columns)
+                fine[part] += np.float32(scale) * (np.sign(field) if name != "smooth" else field)
+
+        over(batches(len(rows), 256), add)
         return fine
 
     def points(
@@ -148,7 +157,8 @@ def _smoothed_noise(seed: int, name: str, rows: range, columns: range, sigma: fl
     m = int(np.ceil(4 * sigma))
     wide = [range(r.start - m, r.stop + m) for r in (rows, columns)]
     out = np.empty((len(wide[0]), len(wide[1])), np.float32)
-    for bi in range(wide[0].start // _BLOCK, -(-wide[0].stop // _BLOCK)):
+
+    def fill(bi: int) -> None:
         for bj in range(wide[1].start // _BLOCK, -(-wide[1].stop // _BLOCK)):
             block = _generator(seed, name, bi, bj).standard_normal((_BLOCK, _BLOCK), np.float32)
             (i0, i1), (j0, j1) = (
@@ -159,6 +169,8 @@ def _smoothed_noise(seed: int, name: str, rows: range, columns: range, sigma: fl
             out[
                 i0 - wide[0].start : i1 - wide[0].start, j0 - wide[1].start : j1 - wide[1].start
             ] = part
+
+    over(range(wide[0].start // _BLOCK, -(-wide[0].stop // _BLOCK)), fill)
     kernel = cv2.getGaussianKernel(2 * m + 1, sigma, cv2.CV_64F)
     smooth = cv2.sepFilter2D(out, cv2.CV_32F, kernel, kernel)[m:-m, m:-m]
     return np.asarray(smooth / np.float32(np.sum(kernel**2)))
