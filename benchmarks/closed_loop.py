@@ -1,6 +1,6 @@
 """What images are worth as fixes, and the closed loop against the open one with the same errors.
 
-    python benchmarks/closed_loop.py [--sets 7] [--members 8] [--case TC-1]
+    python benchmarks/closed_loop.py [--sets 7] [--members 8] [--case TC-2]
 
 Every set has a place, a surface, speckle, noise and a misalignment of its own, and flies three
 images with an ensemble of initial errors. Printed are the errors of the fixes over all images, the
@@ -208,6 +208,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=7)
     parser.add_argument("--members", type=int, default=8)
-    parser.add_argument("--case", choices=SIGMA, default="TC-1")
+    parser.add_argument("--case", choices=SIGMA, default="TC-2")
     arguments = parser.parse_args()
     table(arguments.case, arguments.sets, arguments.members)
