@@ -22,7 +22,7 @@ Single = NDArray[np.float32]
 KEYS = ("height_m", "latitude0_deg", "longitude0_deg", "latitude_step_deg", "longitude_step_deg")
 """Arrays in a file of `write_dem`."""
 JACKSBORO = "jacksboro"
-"""Name of the elevation model that comes with matplotlib: 36.6 N, 84.3 W, of SRTM."""
+"""Name of the elevation model that comes with matplotlib: 36.3 N, 84.25 W, of SRTM."""
 
 _VOID = -32768
 _SIZES = {1201 * 1201 * 2: 1201, 3601 * 3601 * 2: 3601}
@@ -240,19 +240,19 @@ def read_hgt(path: Path) -> Dem:
 
 
 def read_jacksboro() -> Dem:
-    """Elevation model that comes with matplotlib, 30 x 32 km about 36.6 N, 84.3 W.
+    """Elevation model that comes with matplotlib, 30 x 32 km about 36.3 N, 84.25 W.
 
-    Its bounds are those of its outer points' cells. The file has its north and south swapped: row
-    0 is the northernmost, as the gallery's shaded relief shows it.
+    Row 0 of the file is the northernmost and its bounds are those of the outer points' cells. Its
+    ``ymax`` is the northern border; its ``ymin`` lies one height of the model *north* of that, by
+    a wrong sign, so the southern border is formed from the step: Cross Mountain, the summit, then
+    lies at 36.198 N, 84.231 W, where it is.
     """
     from matplotlib import cbook
 
     arrays: Any = cbook.get_sample_data("jacksboro_fault_dem.npz")
-    north, south = (float(arrays[k]) for k in ("ymin", "ymax"))
-    south, north = min(south, north), max(south, north)
     height = np.ascontiguousarray(arrays["elevation"][::-1], dtype=np.float32)
-    d_lat = (north - south) / height.shape[0]
-    d_lon = (float(arrays["xmax"]) - float(arrays["xmin"])) / height.shape[1]
+    d_lat, d_lon = float(arrays["dy"]), float(arrays["dx"])
+    south = float(arrays["ymax"]) - height.shape[0] * d_lat
     return Dem(
         height,
         float(np.radians(south + d_lat / 2)),

@@ -77,7 +77,7 @@ def test_images_formed_with_the_estimate_become_fixes(flown):
     assert np.linalg.norm(before[-1], axis=1).max() < 500
     D = at_fix(flown, "matcher.fix.D")
     assert np.linalg.eigvalsh(D) == pytest.approx(
-        np.tile([0.14**2, 0.22**2, 1.28**2], (3, 1)), rel=1e-6
+        np.tile([0.33**2, 0.36**2, 1.46**2], (3, 1)), rel=1e-6
     )
 
 

@@ -86,19 +86,21 @@ def test_flat_ground_is_flat_everywhere():
     assert flat_dem(7.0).at([-1.5, 0.3], [3.0, -2.0]) == pytest.approx([7.0, 7.0])
 
 
-def test_jacksboro_is_the_right_way_up():
-    """Cumberland Mountain's ridge (about 1000 m) lies northwest of the Powell valley.
+def test_jacksboro_is_where_it_is():
+    """Cross Mountain, the summit of the Cumberlands in Tennessee, is at 36.198 N, 84.231 W.
 
-    The file's bounds are those of the quadrangle; the ridges of the Valley and Ridge province, low
-    and parallel, lie in its southeast, the Cumberland Plateau, high, in its northwest.
+    The ridges of the Valley and Ridge province, low and parallel, lie in the model's southeast;
+    the Cumberland Mountains, high, in its northwest.
     """
     dem = read_jacksboro()
     assert dem.height.shape == (344, 403)
     assert dem.height.min() == 236
     assert dem.height.max() == 1076
-    south, north = np.degrees([dem.latitude0, dem.latitude0 + 343 * dem.latitude_step])
-    assert 36.44 < south < 36.45
-    assert 36.73 < north < 36.74
+    row, column = np.unravel_index(np.argmax(dem.height), dem.height.shape)
+    latitude = np.degrees(dem.latitude0 + row * dem.latitude_step)
+    longitude = np.degrees(dem.longitude0 + column * dem.longitude_step)
+    assert latitude == pytest.approx(36.1983, abs=1e-3)
+    assert longitude == pytest.approx(-84.2306, abs=1e-3)
     n_lat, n_lon = dem.height.shape
     northwest = dem.height[n_lat // 2 :, : n_lon // 2].mean()
     southeast = dem.height[: n_lat // 2, n_lon // 2 :].mean()
