@@ -1,4 +1,4 @@
-"""Kernels compiled from C: CasADi's of the function, and the driver ``kernel.c``."""
+"""Kernels compiled from C: CasADi's of the function, ``noise.c``, and the driver ``kernel.c``."""
 
 from __future__ import annotations
 
@@ -17,9 +17,19 @@ _DRAWN_AT_ONCE = 2048  # pairs of normals: 32 kB of scratch
 _LANES = 4  # ciphers side by side: with more, one member alone pays for numbers it does not use
 
 
+_EXPORT = """\
+#if defined(_WIN32)
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+"""
+
+
 @cache
 def _driver() -> str:
-    return Path(__file__).with_name("kernel.c").read_text()
+    here = Path(__file__)
+    return _EXPORT + "\n".join(here.with_name(f).read_text() for f in ("noise.c", "kernel.c"))
 
 
 def _pairs(argument: Argument) -> int:
@@ -54,13 +64,13 @@ def kernel_source(kernel: Kernel) -> str:
     }
     code = generator.dump()
     if kernel.function.is_a("SXFunction"):
-        code = _without_null_checks(code)
+        code = without_null_checks(code)
     lines = ["#define CASADI_SYMBOL_EXPORT static", code]
     lines += [f"#define {name} {value}".rstrip() for name, value in definitions.items()]
     return "\n".join([*lines, _driver()])
 
 
-def _without_null_checks(code: str) -> str:
+def without_null_checks(code: str) -> str:
     """Read arguments and write results unconditionally: the driver always passes all of them.
 
     CasADi asks at every access whether it was given a pointer. Those branches cost no time when

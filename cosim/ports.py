@@ -124,6 +124,8 @@ class Port(Declaration, Generic[View]):
         How many unread messages are kept.
     window : bool
         Whether an input collects all samples since the last step.
+    needed_at_start : bool
+        Whether a message must have come at t = 0; members without it are excluded.
     """
 
     kind: Kind = "signal"
@@ -145,6 +147,7 @@ class Port(Declaration, Generic[View]):
         queue: int = 1,
         window: bool = False,
         optional: bool = False,
+        needed_at_start: bool = False,
     ) -> None:
         if isinstance(shape, int) or any(n is not None and n < 1 for n in shape):
             raise ConfigurationError(f"shape is {shape}; it is a tuple of sizes, such as (3,)")
@@ -183,6 +186,7 @@ class Port(Declaration, Generic[View]):
         self.default = default
         self.queue = queue
         self.window = window
+        self.needed_at_start = needed_at_start
         self.optional = optional or default is not None
 
     @property

@@ -32,7 +32,7 @@ Symbols = Mapping[str, Any]
 
 
 class SymbolicModel(Protocol):
-    """What is needed of a model: names, shapes, and two functions of flat row-major arguments."""
+    """What is needed of a model: names, shapes, and functions of flat row-major arguments."""
 
     @property
     def name(self) -> str:
@@ -69,11 +69,18 @@ class SymbolicModel(Protocol):
     def shape(self, name: str) -> tuple[int, ...]:
         """Shape of a named quantity."""
 
-    def step_function(self) -> Any:
+    @property
+    def derivatives(self) -> Symbols:
+        """Derivatives of continuous states by name."""
+
+    def step_function(self, name: str | None = None) -> Any:
         """(inputs, states, parameters, noise, step, time) to (outputs, states)."""
 
-    def initial_function(self) -> Any:
+    def initial_function(self, name: str | None = None) -> Any:
         """(inputs, parameters, noise, step, time) to (outputs, states)."""
+
+    def rate_function(self, name: str | None = None) -> Any:
+        """(inputs, states, parameters, noise, step, time) to (outputs, derivatives)."""
 
 
 class SymbolicComponent(Component):
@@ -177,6 +184,7 @@ class SymbolicComponent(Component):
         self._dt = np.zeros(1)
         self._t = np.zeros(1)
         self._failed = np.zeros(n, dtype=np.uint8)
+        self._messages: dict[str, FloatArray] = {}
 
     def _state_shape(self, name: str) -> tuple[int, ...]:
         shape = self.model.shape(name)
@@ -190,7 +198,6 @@ class SymbolicComponent(Component):
         arrays |= {f"state:{n}": self._states[n] for n in model.states}
         arrays |= {n: self._settings[n] for n in model.parameters}
         arrays |= {"step": self._dt, "time": self._t}
-        self._messages: dict[str, FloatArray] = {}
         results = {n: self._output_array(n) for n in model.outputs}
         results |= {f"state:{n}": self._states[n] for n in model.states}
         keys = {n: stream_key(env.seed, env.path, n) for n in model.noise}
@@ -237,6 +244,9 @@ class SymbolicComponent(Component):
 
     def _initialize_impl(self) -> None:
         model, env = self.model, self.environment
+        for name, port in self.inputs().items():
+            if port.needed_at_start:
+                self.fail(~self._views[name].fresh, f"no '{name}' was received at t = 0")
         function = model.initial_function()
         inputs = [self._input_array(n).reshape(self.n_members, -1) for n in model.inputs]
         inputs += [self._settings[n].reshape(self.n_members, -1) for n in model.parameters]

@@ -212,15 +212,24 @@ class Model:
             outputs = dict(zip(outputs, replaced, strict=True))
         return outputs | {f"next:{k}": e for k, e in zip(keys, after, strict=True)}
 
-    def step_function(self) -> Any:
-        """Build the step as a function of flat row-major arguments.
+    def step_function(self, name: str | None = None) -> Any:
+        """Build the step as a function of flat row-major arguments, called `name` in C.
 
         Inputs, states, parameters, noise, step and time, in this order, to outputs and states.
         """
         outputs = {k.replace("next:", "next_"): e for k, e in self.step_outputs.items()}
-        return self._function(f"{self.name}_step", outputs)
+        return self._function(name or f"{self.name}_step", outputs)
 
-    def initial_function(self) -> Any:
+    def rate_function(self, name: str | None = None) -> Any:
+        """Build outputs and derivatives of continuous states as a function.
+
+        Of the arguments of `step_function`, with the states as they are, not a step earlier.
+        """
+        outputs = {k: ca.SX(e) for k, e in self.outputs.items()}
+        rates = {f"der_{k}": ca.SX(e) for k, e in self.derivatives.items()}
+        return self._function(name or f"{self.name}_rate", outputs | rates)
+
+    def initial_function(self, name: str | None = None) -> Any:
         """Build the start: as `step_function` without states among its arguments; the step is 0."""
         start = {
             k: ca.densify(ca.SX(self.initial.get(k, ca.SX.zeros(*s.shape))))
@@ -233,7 +242,7 @@ class Model:
             )
             outputs = dict(zip(outputs, replaced, strict=True))
         return self._function(
-            f"{self.name}_initial",
+            name or f"{self.name}_initial",
             outputs | {f"next_{k}": e for k, e in start.items()},
             drop_states=True,
         )

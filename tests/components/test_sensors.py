@@ -335,8 +335,8 @@ def corrected(present, members=1):
 def test_a_filter_that_is_told_no_state_fails_and_the_others_fly():
     result = corrected([0, 0, 0, 1], members=4)
     assert [(e["member"], e["component"], e["t_s"], e["reason"]) for e in result.excluded] == [
-        (1, "predict", 0.0, "no state was known at the start"),
-        (3, "predict", 0.0, "no state was known at the start"),
+        (1, "predict", 0.0, "no 'start' was received at t = 0"),
+        (3, "predict", 0.0, "no 'start' was received at t = 0"),
     ]
     prior = result.dataset["predict.prior.r_e"]
     assert np.isfinite(prior.sel(member=[0, 2])).all()
