@@ -35,7 +35,7 @@ from typing import Protocol
 
 from terrafix.cosim.errors import ConfigurationError, TerrafixError
 
-_FLAGS = ("-O1", "-ftree-vectorize", "-fno-math-errno", "-ffp-contract=off")
+FLAGS = ("-O1", "-ftree-vectorize", "-fno-math-errno", "-ffp-contract=off")
 """No contraction, no reassociation: the virtual machine's bits.
 
 Straight-line generated code runs as fast at ``-O1`` as at ``-O3`` (within 2 % at 2,500 and 7,600
@@ -78,7 +78,7 @@ class Compiler:
     def options(self) -> tuple[str, ...]:
         """What is written between the command and the source."""
         position = () if sys.platform == "win32" else ("-fPIC",)
-        return (*_FLAGS, *position, *_LIBRARY)
+        return (*FLAGS, *position, *_LIBRARY)
 
     def compile(self, source: str) -> bytes:
         """Compile `source` to a shared library.
@@ -135,6 +135,24 @@ def find_compiler() -> Compiler | None:
             f"TERRAFIX_KERNEL=c asks for compiled kernels, which cannot be had: {_why_none()}"
         )
     return None
+
+
+def working_compiler() -> Compiler:
+    """The compiler that serves, whether or not kernels are compiled.
+
+    Raises
+    ------
+    ConfigurationError
+        If none works.
+    """
+    for command in _commands():
+        compiler = _identify(command)
+        if compiler and _works(compiler):
+            return compiler
+    raise ConfigurationError(
+        "there is no C compiler that works\n"
+        "  install one, or `pip install terrafix[ziglang]`, which brings its own"
+    )
 
 
 class _Kernel(Protocol):

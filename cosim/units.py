@@ -100,3 +100,41 @@ def _json_numbers(text: str) -> str:
         return json.dumps(_number(match[0]))
 
     return re.sub(r"[^\s\[\],]+", convert, text)
+
+
+_BASE_UNITS = {
+    "kilogram": "kg",
+    "meter": "m",
+    "second": "s",
+    "ampere": "A",
+    "kelvin": "K",
+    "mole": "mol",
+    "candela": "cd",
+    "radian": "rad",
+}
+
+
+def base_units(text: str) -> tuple[float, dict[str, int]] | None:
+    """Factor to SI base units and their exponents, as FMI wants them: ``m/s^2`` is m 1, s -2.
+
+    None where an exponent is no whole number, or a unit has no base of its own (pixels).
+    """
+    unit = _unit(text)
+    factor, exponents = 1.0, dict[str, int]()
+    for name, power in unit._units.items():
+        if name == "radian":
+            reduced = {"radian": 1.0}
+        else:
+            quantity = _registry().Quantity(1.0, name).to_root_units()
+            factor *= float(quantity.magnitude) ** power
+            reduced = dict(quantity.units._units)
+            if not reduced and name in ("degree", "arcminute", "arcsecond", "milliradian"):
+                reduced = {"radian": 1.0}
+        for base, each in reduced.items():
+            if base == "gram":
+                base, factor = "kilogram", factor * 1e-3 ** (each * power)
+            if base not in _BASE_UNITS or each * power != int(each * power):
+                return None
+            symbol = _BASE_UNITS[base]
+            exponents[symbol] = exponents.get(symbol, 0) + int(each * power)
+    return factor, {symbol: power for symbol, power in exponents.items() if power}

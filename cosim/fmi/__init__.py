@@ -1,0 +1,1 @@
+"""Functional Mock-up Units: export of symbolic components, import and checks of anybody's."""

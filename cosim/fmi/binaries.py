@@ -1,0 +1,154 @@
+"""Binaries of an FMU: by the host's compiler, or for five platforms by ``zig cc``."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from terrafix.cosim.errors import ConfigurationError, nearest
+from terrafix.cosim.toolchain import FLAGS, working_compiler
+
+
+@dataclass(frozen=True)
+class Platform:
+    """A platform: its folder in FMI 3 and in FMI 2, and zig's name for it."""
+
+    name: str
+    fmi2: str | None
+    target: str
+    suffix: str
+
+    def folder(self, version: int) -> str:
+        """Folder of its binary below ``binaries/``."""
+        return self.name if version == 3 else (self.fmi2 or self.name)
+
+
+PLATFORMS = {
+    p.name: p
+    for p in (
+        Platform("x86_64-linux", "linux64", "x86_64-linux-gnu.2.17", ".so"),
+        Platform("aarch64-linux", None, "aarch64-linux-gnu.2.17", ".so"),
+        Platform("x86_64-windows", "win64", "x86_64-windows-gnu", ".dll"),
+        Platform("x86_64-darwin", "darwin64", "x86_64-macos", ".dylib"),
+        Platform("aarch64-darwin", None, "aarch64-macos", ".dylib"),
+    )
+}
+"""By FMI 3's name. FMI 2 names three of them; for the others FMI 3's names are taken there too."""
+
+
+def host_platform() -> Platform:
+    """The platform this runs on.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is none of `PLATFORMS`.
+    """
+    machine = platform.machine().lower()
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
+    system = {"win32": "windows"}.get(sys.platform, sys.platform)
+    name = f"{machine}-{system}"
+    if name not in PLATFORMS:
+        raise ConfigurationError(
+            f"FMUs cannot be built for this machine, {name}\n  platforms: {', '.join(PLATFORMS)}"
+        )
+    return PLATFORMS[name]
+
+
+def chosen_platforms(text: str) -> tuple[Platform | None, ...]:
+    """Read ``host``, ``all`` or a list of names; None is the host with its own compiler.
+
+    Raises
+    ------
+    ConfigurationError
+        If a name is not known.
+    """
+    names = [n for n in text.replace(",", " ").split() if n]
+    if names == ["all"]:
+        return tuple(PLATFORMS.values())
+    chosen: list[Platform | None] = []
+    for name in names:
+        if name != "host" and name not in PLATFORMS:
+            known = ["host", "all", *PLATFORMS]
+            raise ConfigurationError(
+                f"there is no platform '{name}'\n  {nearest(name, known, what='platforms')}"
+            )
+        chosen.append(None if name == "host" else PLATFORMS[name])
+    if not chosen:
+        raise ConfigurationError(f"no platform is named\n  platforms: host, all, {', '.join(PLATFORMS)}")
+    return tuple(dict.fromkeys(chosen))
+
+
+def build(
+    files: Mapping[str, str],
+    compiled: Sequence[str],
+    platforms: Sequence[Platform | None],
+) -> dict[Platform, bytes]:
+    """Compile the sources for every platform, side by side.
+
+    Parameters
+    ----------
+    files : mapping of str to str
+        Sources and headers by name.
+    compiled : sequence of str
+        Which of them are compiled.
+    platforms : sequence of Platform or None
+        None is the host, with its own compiler.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no compiler, or it refuses.
+    """
+    jobs = [(p or host_platform(), _command(p)) for p in platforms]
+    with tempfile.TemporaryDirectory(prefix="terrafix-fmu-") as folder:
+        for name, text in files.items():
+            Path(folder, name).write_text(text, encoding="utf-8")
+
+        def one(job: tuple[Platform, tuple[str, ...]]) -> bytes:
+            return _compile(Path(folder), compiled, *job)
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            binaries = list(pool.map(one, jobs))
+    return dict(zip([p for p, _ in jobs], binaries, strict=True))
+
+
+def _command(chosen: Platform | None) -> tuple[str, ...]:
+    if chosen is None:
+        return working_compiler().command
+    if importlib.util.find_spec("ziglang"):
+        return (sys.executable, "-m", "ziglang", "cc", "-target", chosen.target)
+    raise ConfigurationError(
+        f"a binary for {chosen.name} needs zig's compiler\n"
+        "  install it with `pip install terrafix[ziglang]`, or take --platforms host"
+    )
+
+
+def _compile(
+    folder: Path, compiled: Sequence[str], target: Platform, command: Sequence[str]
+) -> bytes:
+    library = folder / f"{target.name}{target.suffix}"
+    position = [] if target.suffix == ".dll" else ["-fPIC"]
+    words = [*command, "-std=gnu11", *FLAGS, *position, "-shared", "-fvisibility=hidden", "-w", "-g0"]
+    words += [str(folder / name) for name in compiled]
+    words += ["-o", str(library)]
+    words += ["-s"] if target.suffix != ".dylib" else []
+    words += ["-lm"] if target.suffix == ".so" else []
+    done = subprocess.run(
+        words, capture_output=True, text=True, errors="replace", check=False, cwd=folder
+    )
+    if done.returncode:
+        said = [line.strip() for line in done.stderr.splitlines() if "error" in line.lower()]
+        raise ConfigurationError(
+            f"the FMU could not be compiled for {target.name}: "
+            f"{(said or done.stderr.strip().splitlines() or ['no message'])[0]}"
+        )
+    return library.read_bytes()
