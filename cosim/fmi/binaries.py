@@ -17,6 +17,9 @@ from terrafix.cosim.errors import ConfigurationError, nearest
 from terrafix.cosim.toolchain import FLAGS, working_compiler
 
 
+LONG = 150_000  # characters of C
+
+
 @dataclass(frozen=True)
 class Platform:
     """A platform: its folder in FMI 3 and in FMI 2, and zig's name for it."""
@@ -108,47 +111,72 @@ def build(
     ConfigurationError
         If there is no compiler, or it refuses.
     """
-    jobs = [(p or host_platform(), _command(p)) for p in platforms]
-    with tempfile.TemporaryDirectory(prefix="terrafix-fmu-") as folder:
+    targets = [(p or host_platform(), _command(p)) for p in platforms]
+    order = sorted(compiled, key=lambda name: -len(files[name]))  # the longest first
+    with (
+        tempfile.TemporaryDirectory(prefix="terrafix-fmu-") as folder,
+        ThreadPoolExecutor(os.cpu_count()) as pool,
+    ):
+        here = Path(folder)
         for name, text in files.items():
-            Path(folder, name).write_text(text, encoding="utf-8")
-
-        def one(job: tuple[Platform, tuple[str, ...]]) -> bytes:
-            return _compile(Path(folder), compiled, *job)
-
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            binaries = list(pool.map(one, jobs))
-    return dict(zip([p for p, _ in jobs], binaries, strict=True))
+            (here / name).write_text(text, encoding="utf-8")
+        jobs = [(here, name, _flags(name, files[name]), *t) for name in order for t in targets]
+        list(pool.map(lambda job: _compile(*job), jobs))
+        binaries = list(pool.map(lambda target: _link(here, order, *target), targets))
+    return dict(zip([p for p, _ in targets], binaries, strict=True))
 
 
 def _command(chosen: Platform | None) -> tuple[str, ...]:
     if chosen is None:
         return working_compiler().command
-    if importlib.util.find_spec("ziglang"):
-        return (sys.executable, "-m", "ziglang", "cc", "-target", chosen.target)
+    zig = importlib.util.find_spec("ziglang")
+    if zig is not None and zig.submodule_search_locations:
+        program = Path(zig.submodule_search_locations[0], "zig" + ".exe" * (os.name == "nt"))
+        return (str(program), "cc", "-target", chosen.target)
     raise ConfigurationError(
         f"a binary for {chosen.name} needs zig's compiler\n"
         "  install it with `pip install terrafix[ziglang]`, or take --platforms host"
     )
 
 
+def _object(name: str, target: Platform) -> str:
+    return f"{name}.{target.name}.o"
+
+
+def _flags(name: str, text: str) -> list[str]:
+    """Flags of ensemble kernels; long derivatives are not optimized, which takes ten seconds."""
+    plain = name.endswith("_forward.c") and len(text) > LONG
+    return ["-O0" if plain and f == "-O1" else f for f in FLAGS]
+
+
 def _compile(
-    folder: Path, compiled: Sequence[str], target: Platform, command: Sequence[str]
+    folder: Path, name: str, flags: Sequence[str], target: Platform, command: Sequence[str]
+) -> None:
+    words = [*command, "-std=gnu11", *flags, "-fvisibility=hidden", "-w", "-g0"]
+    words += [] if target.suffix == ".dll" else ["-fPIC"]
+    words += ["-fno-sanitize=undefined"] if "zig" in Path(command[0]).name else []
+    _run([*words, "-c", name, "-o", _object(name, target)], folder, target)
+
+
+def _link(
+    folder: Path, names: Sequence[str], target: Platform, command: Sequence[str]
 ) -> bytes:
     library = folder / f"{target.name}{target.suffix}"
-    position = [] if target.suffix == ".dll" else ["-fPIC"]
-    words = [*command, "-std=gnu11", *FLAGS, *position, "-shared", "-fvisibility=hidden", "-w", "-g0"]
-    words += [str(folder / name) for name in compiled]
-    words += ["-o", str(library)]
+    words = [*command, "-shared", *(_object(n, target) for n in names), "-o", library.name]
     words += ["-s"] if target.suffix != ".dylib" else []
-    words += ["-lm"] if target.suffix == ".so" else []
+    words += ["-Wl,--no-undefined", "-lm"] if target.suffix == ".so" else []
+    _run(words, folder, target)
+    return library.read_bytes()
+
+
+def _run(words: Sequence[str], folder: Path, target: Platform) -> None:
     done = subprocess.run(
         words, capture_output=True, text=True, errors="replace", check=False, cwd=folder
     )
     if done.returncode:
-        said = [line.strip() for line in done.stderr.splitlines() if "error" in line.lower()]
+        said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+        errors = [line for line in said if "error" in line.lower()]
         raise ConfigurationError(
             f"the FMU could not be compiled for {target.name}: "
-            f"{(said or done.stderr.strip().splitlines() or ['no message'])[0]}"
+            f"{(errors or said or ['no message'])[0]}"
         )
-    return library.read_bytes()

@@ -9,7 +9,6 @@ from importlib.metadata import version as installed
 from xml.etree import ElementTree as ET
 
 from terrafix.cosim.clock import text_seconds
-from terrafix.cosim.fmi.code import compiled
 from terrafix.cosim.fmi.layout import Layout, Unknown
 from terrafix.cosim.fmi.variables import Variable
 from terrafix.cosim.units import base_units
@@ -20,20 +19,22 @@ READ_AT_START = "read at the start of a step: the value of the time the step beg
 READ_AT_END = "read at the end of a step: set the value of the time the step ends"
 
 
-def model_description(layout: Layout, version: int, token: str, identifier: str) -> bytes:
-    """Write modelDescription.xml for FMI 2 or 3."""
-    writer = _Fmi2(layout) if version == 2 else _Fmi3(layout)
+def model_description(
+    layout: Layout, version: int, token: str, identifier: str, files: Sequence[str]
+) -> bytes:
+    """Write modelDescription.xml for FMI 2 or 3; `files` are the sources to compile."""
+    writer = _Fmi2(layout, files) if version == 2 else _Fmi3(layout)
     return _bytes(writer.root(token, identifier))
 
 
-def build_description(version: int, identifier: str) -> bytes:
-    """Write sources/buildDescription.xml (FMI 3; FMI 2 lists its sources in the description)."""
+def build_description(identifier: str, compiled: Sequence[str]) -> bytes:
+    """Write sources/buildDescription.xml: what to compile, and how."""
     root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
     configuration = ET.SubElement(root, "BuildConfiguration", modelIdentifier=identifier)
     files = ET.SubElement(
         configuration, "SourceFileSet", language="C11", compiler="gcc", compilerOptions=FLAGS
     )
-    for name in compiled(version):
+    for name in compiled:
         ET.SubElement(files, "SourceFile", name=name)
     return _bytes(root)
 
@@ -284,8 +285,9 @@ class _Fmi3(_Writer):
 
 
 class _Fmi2(_Writer):
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: Layout, files: Sequence[str]) -> None:
         super().__init__(layout)
+        self._files = files
         self._first: dict[int, int] = {}
         count = 1
         for variable in self.variables:
@@ -322,7 +324,7 @@ class _Fmi2(_Writer):
             kinds.insert(0, ("ModelExchange", {"completedIntegratorStepNotNeeded": "true"}))
         for tag, attributes in kinds:
             files = ET.SubElement(ET.SubElement(root, tag, shared | attributes), "SourceFiles")
-            for name in compiled(2):
+            for name in self._files:
                 ET.SubElement(files, "File", name=name)
         self.units(root)
         self.types(root, "SimpleType", "Real")

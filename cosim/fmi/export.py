@@ -122,11 +122,12 @@ def export_fmu(
     identifier = source.name
     token = instantiation_token(layout, fmi)
     texts = sources(layout, fmi, token)
-    binaries = build(texts | headers(fmi), compiled(fmi), chosen)
+    files = compiled(texts)
+    binaries = build(texts | headers(fmi), files, chosen)
     content: dict[str, bytes] = {
-        "modelDescription.xml": model_description(layout, fmi, token, identifier),
+        "modelDescription.xml": model_description(layout, fmi, token, identifier, files),
         "documentation/index.html": page(layout).encode(),
-        "sources/buildDescription.xml": build_description(fmi, identifier),
+        "sources/buildDescription.xml": build_description(identifier, files),
     }
     picture = icon(layout)
     if fmi == 2:
