@@ -30,7 +30,7 @@ from terrafix.cosim.ports import Capabilities, Declaration, Port, State
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 ATTRIBUTES = frozenset({"name", "rate", "ports", "step_index", "kernel"})  # of every component
-KEYS = frozenset({"type", "period", "offset", "times", "doc", "file"})  # of its table in a file
+KEYS = frozenset({"type", "period", "offset", "times", "doc"})  # of its table in a file
 
 
 def _own(base: type) -> bool:

@@ -298,6 +298,28 @@ class Text(Setting[str]):
         return value
 
 
+class Table(Setting[dict[str, Any]]):
+    """Values by name, as a table of a system file: ``start = { mass = "12 kg" }``."""
+
+    def __init__(self, *, doc: str = "") -> None:
+        super().__init__({}, doc=doc)
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> dict[str, Any]:
+        """Accept a table, or its text as in a file."""
+        if isinstance(value, str):
+            import tomllib
+
+            try:
+                value = tomllib.loads(f"table = {value}")["table"]
+            except tomllib.TOMLDecodeError:
+                pass
+        if not isinstance(value, dict):
+            raise ConfigurationError(
+                f'{where} is {shown(value)}; it takes a table: write {{ name = "1.0 m" }}'
+            )
+        return dict(value)
+
+
 _VARIABLE = re.compile(r"\$\{(\w+)(?::-([^}]*))?\}|\$(\w+)")
 
 

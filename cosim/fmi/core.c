@@ -345,29 +345,35 @@ static enum status step_part(struct instance *i, int32_t p)
     return OK;
 }
 
-/* Everything due up to and including tick `end`. */
+/* What is read at the start of a step: as it stands when time leaves the end of the last one. */
+static void latch_inputs(struct instance *i)
+{
+    for (int32_t p = 0; p < N_PARTS; p++) {
+        if (i->now.latch[p])
+            copy_all(i, parts[p].latch, parts[p].n_latch);
+        i->now.latch[p] = 0;
+    }
+}
+
+/* Everything due after the present tick, up to and including `end`. */
 static enum status step_to(struct instance *i, int64_t end)
 {
     struct data *now = &i->now;
-    for (;;) {
-        int64_t next = end + 1;
-        for (int32_t p = 0; p < N_PARTS; p++) {
-            if (now->latch[p])
-                copy_all(i, parts[p].latch, parts[p].n_latch);
-            now->latch[p] = 0;
+    while (now->tick < end) {
+        int64_t next = end;
+        for (int32_t p = 0; p < N_PARTS; p++)
             if (now->next_tick[p] < next)
                 next = now->next_tick[p];
-        }
-        now->tick = next > end ? end : next;
-        now->real[TIME] = now->start_time + TICKS_TO_SECONDS(now->tick);
-        if (next > end)
-            return OK;
+        latch_inputs(i);
+        now->tick = next;
+        now->real[TIME] = now->start_time + TICKS_TO_SECONDS(next);
         for (int32_t p = 0; p < N_PARTS; p++)
-            if (now->next_tick[p] == now->tick && step_part(i, p)) {
+            if (now->next_tick[p] == next && step_part(i, p)) {
                 now->mode = FAILED;
                 return ERROR;
             }
     }
+    return OK;
 }
 
 enum status advance(struct instance *i, double t, double h)
