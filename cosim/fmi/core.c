@@ -245,6 +245,18 @@ static void copy_all(struct instance *i, const struct copy *copy, int32_t n)
                    copy->size * sizeof(double));
 }
 
+/* Refuse to start without a message that is needed. */
+static enum status refuse_missing(struct instance *i, const struct part *part)
+{
+    for (int32_t k = 0; k < part->n_received; k++) {
+        const struct received *message = &part->received[k];
+        if (message->required && i->now.integer[message->sequence] < 1)
+            return fail(i, "message '%s' did not come before initialization ended: set its "
+                        "fields and '%s.sequence' to 1", message->name, message->name);
+    }
+    return OK;
+}
+
 /* Note which messages are new; with `keep`, they are read and will not be new again. */
 static void receive(struct instance *i, const struct part *part, int keep)
 {
@@ -317,6 +329,8 @@ static enum status evaluate_start(struct instance *i)
         copy_all(i, part->convert, part->n_convert);
         receive(i, part, part->starts_at_zero);
         draw_noise(i, p);
+        if (refuse_missing(i, part))
+            return ERROR;
         if (evaluate(i, &part->initial, part->target, part->n_target, part->name))
             return ERROR;
         commit(i, part, part->starts_at_zero);
@@ -402,13 +416,6 @@ enum status initialize(struct instance *i)
 
 enum status finish_initialization(struct instance *i, int model_exchange)
 {
-    for (int32_t p = 0; p < N_PARTS; p++)
-        for (int32_t k = 0; k < parts[p].n_received; k++) {
-            const struct received *message = &parts[p].received[k];
-            if (message->required && i->now.integer[message->sequence] < 1)
-                return fail(i, "message '%s' did not come before initialization ended: set its "
-                            "fields and '%s.sequence' to 1", message->name, message->name);
-        }
     if (evaluate_start(i))
         return ERROR;
     i->now.mode = model_exchange ? EVENT : STEPPING;

@@ -1,4 +1,4 @@
-"""The command line: ``terrafix run | check | graph | components``.
+"""The command line: ``terrafix run | check | graph | components | export-fmu | check-fmu | ssp``.
 
 Exit status: 0 fine, 1 a run failed, 2 bad input. With ``--json`` standard output is exactly one
 JSON object; everything else goes to standard error. Nothing heavy is imported before a command
@@ -346,3 +346,47 @@ def components(kind: str | None, as_json: bool) -> None:
         _show(*listing.types_tables(content))
     else:
         _show(*listing.type_tables(content))
+
+
+# ------------------------------------------------------------------------- exchange
+
+
+@main.command("export-fmu")
+@click.argument("what", metavar="SYSTEM.toml[:COMPONENT]")
+@click.option("-o", "out", metavar="FILE.fmu", required=True, help="The file to write.")
+@click.option("--fmi", type=click.Choice(["2", "3"]), default="3", help="Version of the standard.")
+@click.option(
+    "--platforms",
+    metavar="host|all|LIST",
+    default="host",
+    help="Whose binaries it carries; all but the host's own need zig.",
+)
+@_set
+@_json
+def export_fmu_command(
+    what: str, out: str, fmi: str, platforms: str, settings: Settings, as_json: bool
+) -> None:
+    """Export a component, or a whole symbolic system, as an FMU."""
+    from terrafix.cosim.fmi.export import checked_target, export_fmu
+
+    checked_target(out)
+    path, component = _named(what)
+    loaded = _read(path, settings)
+    made = export_fmu(loaded, out, component=component, fmi=int(fmi), platforms=platforms)
+    if as_json:
+        _print_json(made.summary())
+        return
+    _show(
+        f"{made.model}: FMI {made.fmi}, {' and '.join(made.kinds)}; {made.inputs} inputs, "
+        f"{made.outputs} outputs, {made.parameters} parameters; steps are multiples of "
+        f"{made.step_s} s; binaries for {', '.join(made.platforms)}"
+    )
+    print(f"wrote {made.path}", file=sys.stderr)
+
+
+def _named(what: str) -> tuple[str, str | None]:
+    """Split ``SYSTEM.toml:COMPONENT``; a drive letter is no system."""
+    head, colon, tail = what.rpartition(":")
+    if colon and len(head) > 1 and "/" not in tail and "\\" not in tail:
+        return head, tail
+    return what, None
