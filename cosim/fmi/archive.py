@@ -32,13 +32,18 @@ class Archive:
         Where it was unpacked; removed when this process ends.
     description : fmpy.model_description.ModelDescription
     version : {2, 3}
+    directional : bool
+        Whether it says that it has directional derivatives.
+    annotation : Element or None
+        What terrafix wrote about the ports of an FMU of its own.
     """
 
     path: Path
     folder: Path
     description: Any
     version: int
-    _interface: Any = field(default=None, repr=False)
+    directional: bool = False
+    annotation: Any = field(default=None, repr=False)
 
     def binary(self, identifier: str) -> Path:
         """The binary for this machine.
@@ -200,6 +205,11 @@ def _read(file: Path, folder: Path) -> Archive:
             f"'{file}': modelDescription.xml cannot be understood: {error}\n"
             f"  terrafix check-fmu {file} says more"
         ) from error
-    archive = Archive(file, folder, description, int(version[0]))
-    archive._interface = next(root.iter("Interface"), None)
-    return archive
+    directional = any(
+        each.get(name) in ("true", "1")
+        for tag in ("CoSimulation", "ModelExchange")
+        for each in root.iter(tag)
+        for name in ("providesDirectionalDerivatives", "providesDirectionalDerivative")
+    )
+    annotation = next(root.iter("Interface"), None)
+    return Archive(file, folder, description, int(version[0]), directional, annotation)

@@ -272,9 +272,10 @@ static void receive(struct instance *i, const struct part *part, int keep)
 }
 
 /* Put results in their places; messages only where they are published. */
-static void commit(struct instance *i, const struct part *part, int publish)
+static void commit(struct instance *i, int32_t p, int publish)
 {
-    int32_t sent[N_MESSAGES] = {0};
+    const struct part *part = &parts[p];
+    int64_t *sent = i->now.sent[p];
     for (int32_t k = 0; k < part->n_published; k++) {
         const struct published *message = &part->published[k];
         sent[k] = publish && (message->valid < 0 || i->next[message->valid] > 0.5);
@@ -333,7 +334,7 @@ static enum status evaluate_start(struct instance *i)
             return ERROR;
         if (evaluate(i, &part->initial, part->target, part->n_target, part->name))
             return ERROR;
-        commit(i, part, part->starts_at_zero);
+        commit(i, p, part->starts_at_zero);
         memcpy(now->real + part->before, now->real + part->state, part->n_state * sizeof(double));
     }
     now->stale = 0;
@@ -352,7 +353,7 @@ static enum status step_part(struct instance *i, int32_t p)
     memcpy(now->real + part->before, now->real + part->state, part->n_state * sizeof(double));
     if (evaluate(i, &part->step, part->target, part->n_target, part->name))
         return ERROR;
-    commit(i, part, 1);
+    commit(i, p, 1);
     now->last_tick[p] = now->tick;
     now->next_tick[p] = following(part, now->tick);
     now->latch[p] = 1;
@@ -637,11 +638,14 @@ enum status seed_tangent(struct instance *i, const struct variable *v, int32_t e
     return OK;
 }
 
-static void put_tangents(struct instance *i, const struct target *target, int32_t n)
+/* Results become tangents; those of a message that was not sent stay zero. */
+static void put_tangents(struct instance *i, const struct target *target, int32_t n,
+                         const int64_t *sent)
 {
     const double *next = i->next;
     for (int32_t k = 0; k < n; next += target[k++].size)
-        memcpy(i->tangent + target[k].offset, next, target[k].size * sizeof(double));
+        if (target[k].message < 0 || sent[target[k].message])
+            memcpy(i->tangent + target[k].offset, next, target[k].size * sizeof(double));
 }
 
 static enum status tangents_of_parts(struct instance *i)
@@ -661,7 +665,7 @@ static enum status tangents_of_parts(struct instance *i)
         if (evaluate(i, starting ? &part->initial_forward : &part->step_forward, part->target,
                      part->n_output, part->name))
             return ERROR;
-        put_tangents(i, part->target, part->n_output);
+        put_tangents(i, part->target, part->n_output, now->sent[p]);
     }
     return OK;
 }
@@ -673,7 +677,7 @@ enum status propagate_tangent(struct instance *i)
     if (evaluate(i, &continuous.rate_forward, continuous.target, continuous.n_target,
                  parts[0].name))
         return ERROR;
-    put_tangents(i, continuous.target, continuous.n_target);
+    put_tangents(i, continuous.target, continuous.n_target, i->now.sent[0]);
     return OK;
 }
 

@@ -131,6 +131,7 @@ struct data {
     int64_t tick;
     int64_t next_tick[N_PARTS], last_tick[N_PARTS], step_index[N_PARTS], latch[N_PARTS];
     int64_t integer[N_INTEGER];
+    int64_t sent[N_PARTS][N_MESSAGES]; /* messages of the last step */
     uint64_t key[N_STREAMS];
     double start_time;
     int64_t event_tick;

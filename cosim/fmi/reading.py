@@ -152,7 +152,7 @@ def read_interface(archive: Archive, kind: str = "auto") -> Interface:
         )
     interface = description.coSimulation if chosen == CO_SIMULATION else description.modelExchange
     quantities, left_out = _quantities(archive)
-    found = archive._interface
+    found = archive.annotation
     ports = _own_ports(archive, found, quantities) if found is not None else _ports(quantities)
     return Interface(
         archive,

@@ -390,3 +390,27 @@ def _named(what: str) -> tuple[str, str | None]:
     if colon and len(head) > 1 and "/" not in tail and "\\" not in tail:
         return head, tail
     return what, None
+
+
+@main.command("check-fmu")
+@click.argument("file", metavar="FILE.fmu")
+@_json
+def check_fmu_command(file: str, as_json: bool) -> int:
+    """Check anybody's FMU: its description, its binaries, and what they do."""
+    from terrafix.cosim.fmi.checking import check_fmu
+    from terrafix.progress import ProgressBar, stderr_is_terminal
+
+    with ProgressBar(shown=stderr_is_terminal(), first="checking") as progress:
+        report = check_fmu(file, progress=progress)
+    if as_json:
+        _print_json(report.summary())
+    else:
+        kinds = " and ".join(report.kinds)
+        _show(f"{report.model}: FMI {report.fmi}, {kinds}; checked: {', '.join(report.checks)}")
+        for found in [*report.findings, *report.notes]:
+            print(f"{found.severity}: {found.check}: {found.where}: {found.what}")
+            if found.why:
+                print(f"  {found.why}")
+        count = len(report.findings)
+        print("no findings" if not count else f"{count} finding{'s' if count > 1 else ''}")
+    return 0 if report.ok else FAILED
