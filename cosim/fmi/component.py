@@ -55,6 +55,7 @@ class Fmu(Component):
     hold_start_values = Flag(
         False, doc="inputs read at the start keep their start values through the first step"
     )
+    arrays = Flag(True, doc="elements r[1], r[2], ... of FMI 2 form an array port")
     start = Table(doc="parameters and start values of inputs by name, with units")
     units = Table(doc="units of ports by name, where the FMU does not say")
     frames = Table(doc="frames of ports by name, where the FMU does not say")
@@ -80,7 +81,9 @@ class Fmu(Component):
     def prepare(self) -> None:
         """Read the file, and declare its ports."""
         archive = open_archive(self._base["file"])
-        self._interface = found = read_interface(archive, self._base["kind"])
+        self._interface = found = read_interface(
+            archive, self._base["kind"], arrays=self._base["arrays"]
+        )
         archive.binary(
             (
                 archive.description.coSimulation
@@ -88,7 +91,7 @@ class Fmu(Component):
                 else archive.description.modelExchange
             ).modelIdentifier
         )
-        self._given = self._read_starts(found)
+        self._given = self._read_starts()
         self.ports = {port.name: self._port(port) for port in found.ports}
         for table in ("units", "frames"):
             for name in self._base[table]:
@@ -155,10 +158,9 @@ class Fmu(Component):
         value = np.zeros(quantity.shape) if start is None else np.asarray(start, dtype=np.float64)
         return value.reshape(quantity.shape)
 
-    def _read_starts(self, found: Interface) -> dict[str, FloatArray]:
+    def _read_starts(self) -> dict[str, FloatArray]:
         """Values of ``start``, converted to the units of the variables."""
-        inputs = {q.name: q for p in found.ports if p.is_input for q, _ in p.fields.values()}
-        known = found.parameters | inputs
+        known = self.settable()
         values = {}
         for name, value in self._base["start"].items():
             if name not in known:
@@ -170,6 +172,26 @@ class Fmu(Component):
             reader = Parameter(shape=quantity.shape, unit=quantity.unit, infinite=True)
             values[name] = reader.read(value, where=f"'{self.name}.start.{name}'")
         return values
+
+    def settable(self) -> dict[str, Quantity]:
+        """Parameters and inputs that ``start`` may name."""
+        ports = self.interface.ports
+        inputs = {q.name: q for p in ports if p.is_input for q, _ in p.fields.values()}
+        return self.interface.parameters | inputs
+
+    def given_starts(self) -> dict[str, FloatArray]:
+        """Values of ``start`` in the units of the variables."""
+        return dict(self._given)
+
+    def scalar_names(self) -> dict[str, tuple[str, int]]:
+        """Names of the FMU's scalar inputs and outputs: the port, and the place in it."""
+        names: dict[str, tuple[str, int]] = {}
+        for port in self.interface.ports:
+            quantities = [q for q, _ in port.fields.values()]
+            quantities += [q for q in (port.t, port.sequence) if q is not None]
+            scalars = [name for q in quantities for name in q.scalars()]
+            names |= {name: (port.name, k) for k, name in enumerate(scalars)}
+        return names
 
     def validate(self) -> None:
         """Refuse an FMU whose step does not fit its rate."""

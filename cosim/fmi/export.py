@@ -139,7 +139,7 @@ def export_fmu(
         content[f"sources/{file}"] = text.encode()
     for each, library in binaries.items():
         content[f"binaries/{each.folder(fmi)}/{identifier}{each.suffix}"] = library
-    _write(target, content)
+    write_archive(target, content)
     variables = [*layout.reals, *layout.integers]
     return Exported(
         target,
@@ -191,7 +191,7 @@ def checked_target(path: str | Path, suffix: str = ".fmu") -> Path:
     return target
 
 
-def _write(target: Path, content: Mapping[str, bytes]) -> None:
+def write_archive(target: Path, content: Mapping[str, bytes]) -> None:
     """Write the archive beside its place, then move it there."""
     draft = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:

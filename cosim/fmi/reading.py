@@ -44,6 +44,8 @@ class Quantity:
     start : list of float or None
     causality, variability : str
     doc : str
+    base : int
+        Index of the first element, in names.
     """
 
     name: str
@@ -55,11 +57,21 @@ class Quantity:
     causality: str = "local"
     variability: str = "continuous"
     doc: str = ""
+    base: int = 1
 
     @property
     def size(self) -> int:
         """Number of elements."""
         return int(np.prod(self.shape, dtype=np.int64))
+
+    def scalars(self) -> list[str]:
+        """Names of its elements as FMI 2 has them: ``r[1]``, ``P[1,2]``."""
+        if not self.shape:
+            return [self.name]
+        return [
+            f"{self.name}[{','.join(str(i + self.base) for i in index)}]"
+            for index in np.ndindex(self.shape)
+        ]
 
     def field(self, frame: str | None = None) -> Field:
         """The port's field for it."""
@@ -125,8 +137,8 @@ class Interface:
     own: bool
 
 
-def read_interface(archive: Archive, kind: str = "auto") -> Interface:
-    """Read ports, parameters and capabilities.
+def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True) -> Interface:
+    """Read ports, parameters and capabilities; without `arrays`, every scalar is a port.
 
     Raises
     ------
@@ -151,8 +163,8 @@ def read_interface(archive: Archive, kind: str = "auto") -> Interface:
             f'  write kind = "{offered[0]}", or leave it out'
         )
     interface = description.coSimulation if chosen == CO_SIMULATION else description.modelExchange
-    quantities, left_out = _quantities(archive)
-    found = archive.annotation
+    quantities, left_out = _quantities(archive, arrays=arrays)
+    found = archive.annotation if arrays else None
     ports = _own_ports(archive, found, quantities) if found is not None else _ports(quantities)
     return Interface(
         archive,
@@ -162,14 +174,14 @@ def read_interface(archive: Archive, kind: str = "auto") -> Interface:
         left_out,
         bool(interface.canGetAndSetFMUstate),
         bool(interface.canGetAndSetFMUstate and interface.canSerializeFMUstate),
-        own=found is not None,
+        own=archive.annotation is not None,
     )
 
 
 # --------------------------------------------------------------------------------- variables
 
 
-def _quantities(archive: Archive) -> tuple[list[Quantity], list[str]]:
+def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list[str]]:
     """Inputs, outputs and parameters, elements of arrays together."""
     wanted = ("input", "output", "parameter", "structuralParameter")
     groups: dict[tuple[str, str], list[tuple[tuple[int, ...], Any]]] = {}
@@ -181,7 +193,7 @@ def _quantities(archive: Archive) -> tuple[list[Quantity], list[str]]:
             if variable.causality in ("input", "output"):
                 left_out.append(variable.name)
             continue
-        match = _ELEMENT.match(variable.name) if archive.version == 2 else None
+        match = _ELEMENT.match(variable.name) if arrays and archive.version == 2 else None
         name = match[1] if match else variable.name
         index = tuple(int(i) for i in match[2].split(",")) if match else ()
         groups.setdefault((name, variable.causality), []).append((index, variable))
@@ -191,7 +203,9 @@ def _quantities(archive: Archive) -> tuple[list[Quantity], list[str]]:
         shape = _extent([index for index, _ in members])
         same = len({(v.type, v.variability) for _, v in members}) == 1
         if shape is not None and same:
-            quantities.append(_quantity(name, shape, [v for _, v in members]))
+            made = _quantity(name, shape, [v for _, v in members])
+            made.base = min(min(index) for index, _ in members) if shape else 1
+            quantities.append(made)
         else:
             quantities += [_quantity(v.name, (), [v]) for _, v in members]
     return quantities, left_out

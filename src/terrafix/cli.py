@@ -165,6 +165,15 @@ def _target(option: str, text: str | None, suffixes: tuple[str, ...]) -> Path | 
 
 
 def _read(path: str, settings: Settings) -> System:
+    if Path(path).suffix.lower() == ".ssp":
+        from terrafix.cosim.ssp.reading import read_ssp
+
+        if settings:
+            raise ConfigurationError(
+                f"--set does not reach into '{path}'\n"
+                "  terrafix ssp import writes it as a system file, where everything can be set"
+            )
+        return read_ssp(path)
     from terrafix.cosim.files import read_system
 
     return read_system(path, settings)
@@ -414,3 +423,62 @@ def check_fmu_command(file: str, as_json: bool) -> int:
         count = len(report.findings)
         print("no findings" if not count else f"{count} finding{'s' if count > 1 else ''}")
     return 0 if report.ok else FAILED
+
+
+@main.group()
+def ssp() -> None:
+    """Write systems as SSP packages, and read them."""
+
+
+@ssp.command("export")
+@_system
+@click.option("-o", "out", metavar="FILE.ssp", required=True, help="The file to write.")
+@click.option("--platforms", metavar="host|all|LIST", default="host", help="As in export-fmu.")
+@click.option(
+    "--leave-out",
+    metavar="COMPONENT",
+    multiple=True,
+    help="Do not package a component that only observes; may be given again.",
+)
+@_set
+@_json
+def ssp_export(
+    system: str,
+    out: str,
+    platforms: str,
+    leave_out: tuple[str, ...],
+    settings: Settings,
+    as_json: bool,
+) -> None:
+    """Write a system as a package of FMUs (FMI 2)."""
+    from terrafix.cosim.fmi.export import checked_target
+    from terrafix.cosim.ssp.export import export_ssp
+
+    checked_target(out, ".ssp")
+    made = export_ssp(_read(system, settings), out, platforms=platforms, leave_out=leave_out)
+    if as_json:
+        _print_json(made.summary())
+        return
+    _show(f"{len(made.components)} components, {made.connections} scalar connections")
+    if made.delayed:
+        print(
+            f"note: masters that exchange values after each step delay {len(made.delayed)} "
+            "connections by one step that are read at its end here:",
+            file=sys.stderr,
+        )
+        for connection in made.delayed:
+            print(f"  {connection}", file=sys.stderr)
+    print(f"wrote {made.path}", file=sys.stderr)
+
+
+@ssp.command("import")
+@click.argument("file", metavar="FILE.ssp")
+@click.option("-o", "out", metavar="SYSTEM.toml", required=True, help="The file to write.")
+def ssp_import(file: str, out: str) -> None:
+    """Write a package as a system file, its FMUs beside it."""
+    from terrafix.cosim.fmi.export import checked_target
+    from terrafix.cosim.ssp.reading import import_ssp
+
+    target = checked_target(out, ".toml")
+    folder = import_ssp(file, target)
+    print(f"wrote {target} and {folder}", file=sys.stderr)

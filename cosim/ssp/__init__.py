@@ -1,0 +1,1 @@
+"""System Structure and Parameterization: systems exchanged as packages of FMUs."""
