@@ -49,7 +49,7 @@ class Plan:
     notes: list[str]
 
 
-def check(system: System, *, duration: Fraction | None = None) -> Plan:
+def check(system: System, *, duration: Fraction | None = None, outside: bool = False) -> Plan:
     """Check a system whole.
 
     Parameters
@@ -57,6 +57,8 @@ def check(system: System, *, duration: Fraction | None = None) -> Plan:
     system : System
     duration : Fraction, optional
         Of the run that is meant [s]: recordings that end before it are found too.
+    outside : bool
+        Whether somebody else drives the inputs that the system exposes (for export).
 
     Raises
     ------
@@ -86,7 +88,8 @@ def check(system: System, *, duration: Fraction | None = None) -> Plan:
         )
     for path, component in flat.components.items():
         problems.extend(_component_problems(path, component, duration))
-    problems.extend(_unconnected(flat))
+    exposed = {system.resolve(p)[0] for p in system.exposed.values()} if outside else set()
+    problems.extend(_unconnected(flat, exposed))
     problems.extend(_two_drivers(flat))
     base, grid = _steps(flat)
     problems.extend(_too_fast(flat, grid))
@@ -139,8 +142,8 @@ def _check_units(field: Field) -> None:
         check_unit(unit)
 
 
-def _unconnected(flat: FlatSystem) -> Iterator[TerrafixError]:
-    driven = {c.target for c in flat.connections}
+def _unconnected(flat: FlatSystem, exposed: set[str]) -> Iterator[TerrafixError]:
+    driven = {c.target for c in flat.connections} | exposed
     for path, component in flat.components.items():
         for name, port in component.inputs().items():
             if f"{path}.{name}" in driven or port.optional:

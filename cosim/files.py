@@ -67,7 +67,7 @@ _CONNECTION = re.compile(r"\s*([\w.]+)\s*->\s*([\w.]+)\s*(?:\(\s*delay\s+([^)]+?
 _PORT = re.compile(r"[A-Za-z]\w*(?:\.\w+)+")
 
 
-def read_system(path: str | Path, settings: Settings = ()) -> System:
+def read_system(path: str | Path, settings: Settings = (), *, outside: bool = False) -> System:
     """Read a system from a TOML file, apply settings, and check it whole.
 
     Parameters
@@ -76,6 +76,8 @@ def read_system(path: str | Path, settings: Settings = ()) -> System:
     settings : sequence of (str, str)
         ``("orbit.gravity", "j2")``, as ``--set`` gives them; applied after the file and its
         choices. Numbers without a unit are in the declared (SI) unit.
+    outside : bool
+        Whether exposed inputs are driven from outside, as in an exported system.
 
     Raises
     ------
@@ -88,7 +90,7 @@ def read_system(path: str | Path, settings: Settings = ()) -> System:
     system, load = _load((path,), settings)
     problems = list(load.problems)
     try:
-        check(system)
+        check(system, outside=outside)
     except SystemCheckError as error:
         said = {str(p) for p in problems}
         problems += [

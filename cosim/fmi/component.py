@@ -227,6 +227,7 @@ class Fmu(Component):
             inputs,
             outputs,
             self._start_settings(),
+            self._identities(),
             self._base["solver"],
             float(self._base["tolerance"]),
         )
@@ -258,6 +259,20 @@ class Fmu(Component):
             for name, value in self._given.items()
             if name in parameters
         )
+
+    def _identities(self) -> tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]:
+        """Seed and member of an FMU of terrafix: its noise is that of the native component."""
+        if not self.interface.own:
+            return ()
+        env = self.environment
+        values = {"seed": np.full(env.n_members, env.seed), "member": env.members}
+        found = []
+        for name, numbers in values.items():
+            quantity = self.interface.parameters.get(name)
+            if quantity is not None and name not in self._given:
+                each = tuple(float(v) for v in numbers)
+                found.append((quantity.kind, tuple(quantity.references), each))
+        return tuple(found)
 
     def _view(self, port: str, name: str) -> NDArray[Any]:
         view = self._views[port]

@@ -280,7 +280,7 @@ def source_of(
             raise ConfigurationError(f"'{path}' has no rate\n  give it one: rate=Rate(hz=100)")
         given = {f"{path}.{port}": fields for port, fields in (start or {}).items()}
         return Source.of_component(what, path=path, start=given)
-    plan = check(what)
+    plan = check(what, outside=True)
     if component is None:
         return _whole(what, plan)
     if component not in plan.flat.components:
@@ -369,7 +369,9 @@ def start_values(system: System, plan: Plan, path: str) -> dict[str, dict[str, A
             ) from error
         component = plan.flat.components[path]
         found: dict[str, dict[str, Any]] = {}
-        for name in component.inputs():
+        for name, port in component.inputs().items():
+            if port.at == "start":
+                continue  # nothing is held at t = 0: the declared default
             view = component._views[name]
             if isinstance(view, MessageReader):
                 if not view.sequence[0]:

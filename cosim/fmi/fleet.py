@@ -76,6 +76,7 @@ class Setup:
     inputs: tuple[Group, ...]
     outputs: tuple[Group, ...]
     starts: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
+    each: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
     solver: str = "cvode"
     tolerance: float = 1e-10
 
@@ -229,6 +230,8 @@ class Fleet:
         instance = self.instances[row] = Instance(self.library, f"{self.setup.name}_{row}")
         for kind, vr, values in self.setup.starts:
             instance.set(kind, references(vr), values)
+        for kind, vr, values in self.setup.each:
+            instance.set(kind, references(vr), values[row])
         instance.begin(0.0, stop)
         self._set_all(instance, row)
         for message in messages:

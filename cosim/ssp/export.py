@@ -91,7 +91,7 @@ def export_ssp(
         If something cannot be carried; it is named, and nothing is written.
     """
     target = checked_target(path, ".ssp")
-    plan = check(system)
+    plan = check(system, outside=True)
     for name in leave_out:
         if name not in plan.flat.components:
             raise ConfigurationError(
@@ -112,8 +112,6 @@ def export_ssp(
         content = {"SystemStructure.ssd": writer.document()}
         for p, file in files.items():
             content[f"resources/{_file_name(p)}.fmu"] = file.read_bytes()
-            if (values := writer.parameters(p)) is not None:
-                content[f"resources/{_file_name(p)}.ssv"] = values
     write_archive(target, content)
     delayed = tuple(str(c) for c in connections if plan.flat.port(c.target).at == "end")
     return Packaged(target, tuple(paths), writer.n_connections, delayed, tuple(leave_out))
@@ -203,7 +201,6 @@ class _Writer:
         doc = " ".join(self.system.doc.split())
         if doc:
             top.set("description", doc)
-        self._system_connectors(top)
         elements = ET.SubElement(top, tag(SSD, "Elements"))
         for path in self.paths:
             elements.append(self._component(path))
@@ -229,10 +226,10 @@ class _Writer:
             experiment["stopTime"] = number(float(self.system.duration))
         default = ET.SubElement(root, tag(SSD, "DefaultExperiment"), experiment)
         osp = self._annotation(ET.SubElement(default, tag(SSD, "Annotations")), OPEN_SIMULATION)
-        information = ET.SubElement(osp, tag(OSP, "SimulationInformation"))
-        ET.SubElement(information, tag(OSP, "FixedStepAlgorithm"), baseStepSize=number(step))
+        algorithm = ET.SubElement(osp, tag(OSP, "Algorithm"))
+        ET.SubElement(algorithm, tag(OSP, "FixedStepAlgorithm"), baseStepSize=number(step))
         own = self._annotation(ET.SubElement(root, tag(SSD, "Annotations")), TERRAFIX)
-        ET.SubElement(
+        element = ET.SubElement(
             own,
             tag(OWN, "System"),
             {
@@ -243,6 +240,10 @@ class _Writer:
                 "master": "end-reads in order within a step, as the annotations of the FMUs say",
             },
         )
+        for shown, leaf in self.exposed.items():  # not as connectors: ecos cannot follow those
+            owner, _, port = leaf.rpartition(".")
+            attributes = {"name": shown, "component": _file_name(owner), "port": port}
+            ET.SubElement(element, tag(OWN, "Expose"), attributes)
         ET.indent(root)
         return ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
 
@@ -256,15 +257,6 @@ class _Writer:
         periods = [r.period for r in rates if r is not None and r.period is not None]
         return float(min(periods, default=self.plan.base))
 
-    def _system_connectors(self, top: ET.Element) -> None:
-        if not self.exposed:
-            return
-        connectors = ET.SubElement(top, tag(SSD, "Connectors"))
-        for shown, leaf in self.exposed.items():
-            for name, kind, unit, integer in self._scalars(leaf):
-                outer = shown + name.removeprefix(leaf.rpartition(".")[2])
-                self._connector(connectors, outer, kind, unit, integer=integer)
-
     def _component(self, path: str) -> ET.Element:
         name = _file_name(path)
         element = ET.Element(
@@ -275,7 +267,7 @@ class _Writer:
                 "type": "application/x-fmu-sharedlibrary",
             },
         )
-        driven = {c.target for c in self.connections} | set(self.exposed.values())
+        driven = {c.target for c in self.connections}
         connectors = ET.SubElement(element, tag(SSD, "Connectors"))
         for port in self.interfaces[path].ports:
             leaf = f"{path}.{port.name}"
@@ -285,21 +277,18 @@ class _Writer:
                 self._connector(connectors, scalar, kind, unit, integer=integer)
         if not len(connectors):
             element.remove(connectors)
-        if self.interfaces[path].parameters:
+        values = self._parameters(path)
+        if values is not None:  # inline: not every tool follows a source
             bindings = ET.SubElement(element, tag(SSD, "ParameterBindings"))
-            ET.SubElement(
-                bindings,
-                tag(SSD, "ParameterBinding"),
-                {"type": "application/x-ssp-parameter-set", "source": f"resources/{name}.ssv"},
-            )
+            binding = ET.SubElement(bindings, tag(SSD, "ParameterBinding"))
+            ET.SubElement(binding, tag(SSD, "ParameterValues")).append(values)
         own = self._annotation(ET.SubElement(element, tag(SSD, "Annotations")), TERRAFIX)
         rate = self.plan.flat.components[path].rate
         assert rate is not None
         ET.SubElement(own, tag(OWN, "Rate"), _rate(rate))
         if rate.period is not None:
             osp = self._annotation(element[-1], OPEN_SIMULATION)
-            information = ET.SubElement(osp, tag(OSP, "SimulationInformation"))
-            ET.SubElement(information, tag(OSP, "StepSizeHint"), value=number(self._step()))
+            ET.SubElement(osp, tag(OSP, "StepSizeHint"), value=number(self._step()))
         return element
 
     def _connector(
@@ -359,15 +348,6 @@ class _Writer:
                     )
                 self.n_connections += 1
                 yield element
-        for shown, leaf in self.exposed.items():
-            owner, _, name = leaf.rpartition(".")
-            for scalar, kind, _, _ in self._scalars(leaf):
-                outer = shown + scalar.removeprefix(name)
-                ends = [{"startElement": _file_name(owner), "startConnector": scalar}, {"endConnector": outer}]  # fmt: skip
-                if kind == "input":
-                    ends = [{"startConnector": outer}, {"endElement": _file_name(owner), "endConnector": scalar}]  # fmt: skip
-                self.n_connections += 1
-                yield ET.Element(tag(SSD, "Connection"), ends[0] | ends[1])
 
     def _units(self, root: ET.Element) -> None:
         for path in self.paths:
@@ -379,9 +359,11 @@ class _Writer:
         parent = ET.SubElement(root, tag(SSD, "Units"))
         _write_units(parent, self.units)
 
-    def parameters(self, path: str) -> bytes | None:
+    def _parameters(self, path: str) -> ET.Element | None:
         """The parameter set of one component, with the values its FMU starts with."""
-        found = self.interfaces[path].parameters
+        found = dict(self.interfaces[path].parameters)
+        for name in ("seed", "member"):  # those of the run
+            found.pop(name, None)
         if not found:
             return None
         root = ET.Element(
@@ -405,8 +387,7 @@ class _Writer:
                     ET.SubElement(made, tag(SSV, "Integer"), value=str(int(value)))
         if used:
             _write_units(ET.SubElement(root, tag(SSV, "Units")), used)
-        ET.indent(root)
-        return ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+        return root
 
 
 def _write_units(parent: ET.Element, names: set[str]) -> None:

@@ -138,19 +138,27 @@ class _Reader:
             made = self._fmu(part, base, arrays=part.name not in scalars)
             fmus[part.name] = system.add(made, part.name)
         self._connect(system, structure, fmus)
-        for outer, (_, (name, connector)) in structure.outside.items():
-            port = _port_of(fmus[name], connector)
-            if port is not None and port not in [
-                p.rpartition(".")[2] for p in system.exposed.values() if p.startswith(f"{name}.")
-            ]:
-                shown = _identifier(outer.split("[")[0])
-                if shown not in system.exposed:
-                    system.expose(shown, fmus[name][port])
+        self._expose(system, structure, fmus)
         for name, fmu in fmus.items():
             signals = [fmu[p] for p, port in fmu.outputs().items() if port.kind == "signal"]
             if signals:
                 system.record(name, signals)
         return system
+
+    def _expose(self, system: System, structure: _Structure, fmus: Mapping[str, Fmu]) -> None:
+        """Show the ports behind the connectors of the package's own system."""
+        wanted = [
+            (_identifier(outer.split("[")[0]), name, _port_of(fmus[name], connector))
+            for outer, (_, (name, connector)) in structure.outside.items()
+        ]
+        for element in self.root.iter(tag(OWN, "Expose")):
+            wanted.append(
+                (str(element.get("name")), str(element.get("component")), element.get("port"))
+            )
+        for shown, name, port in wanted:
+            path = f"{name}.{port}"
+            if port is not None and shown not in system.exposed and path not in system.exposed.values():
+                system.expose(shown, fmus[name][port])
 
     # ------------------------------------------------------------------ the document
 

@@ -164,7 +164,7 @@ def _target(option: str, text: str | None, suffixes: tuple[str, ...]) -> Path | 
     return path
 
 
-def _read(path: str, settings: Settings) -> System:
+def _read(path: str, settings: Settings, *, outside: bool = False) -> System:
     if Path(path).suffix.lower() == ".ssp":
         from terrafix.cosim.ssp.reading import read_ssp
 
@@ -176,7 +176,7 @@ def _read(path: str, settings: Settings) -> System:
         return read_ssp(path)
     from terrafix.cosim.files import read_system
 
-    return read_system(path, settings)
+    return read_system(path, settings, outside=outside)
 
 
 def _show(*renderables: Any) -> None:
@@ -380,7 +380,7 @@ def export_fmu_command(
 
     checked_target(out)
     path, component = _named(what)
-    loaded = _read(path, settings)
+    loaded = _read(path, settings, outside=True)
     made = export_fmu(loaded, out, component=component, fmi=int(fmi), platforms=platforms)
     if as_json:
         _print_json(made.summary())
@@ -455,7 +455,9 @@ def ssp_export(
     from terrafix.cosim.ssp.export import export_ssp
 
     checked_target(out, ".ssp")
-    made = export_ssp(_read(system, settings), out, platforms=platforms, leave_out=leave_out)
+    made = export_ssp(
+        _read(system, settings, outside=True), out, platforms=platforms, leave_out=leave_out
+    )
     if as_json:
         _print_json(made.summary())
         return

@@ -1,0 +1,59 @@
+"""Small symbolic components that the tests export."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from terrafix.cosim.clock import Rate
+from terrafix.cosim.parameters import Parameter
+from terrafix.cosim.ports import Input, Output
+from terrafix.cosim.symbolic import SymbolicComponent
+from terrafix.models.model import Model
+
+
+class EulerIntegrator(SymbolicComponent):
+    """x' = u by the explicit Euler method, y = x + 1."""
+
+    default_rate = Rate("0.01")
+
+    u = Input((), unit="1", at="start", default=0.0, doc="derivative")
+    y = Output((), unit="1", doc="state plus one")
+
+    def build_model(self):
+        x, u, dt = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("dt")
+        return Model(
+            "integrator",
+            inputs={"u": u},
+            states={"x": x},
+            next={"x": x + dt * u},
+            outputs={"y": x + 1},
+            step=dt,
+        )
+
+
+class Spring(SymbolicComponent):
+    """A mass on a spring, forced: continuous states, an input, feedthrough."""
+
+    default_rate = Rate("0.01")
+
+    stiffness = Parameter(4.0, unit="N/m", positive=True, doc="of the spring")
+    mass = Parameter(1.5, unit="kg", positive=True, doc="of the body")
+    x0 = Parameter(0.3, unit="m", doc="position at t = 0")
+    force = Input((), unit="N", default=0.25, doc="on the body")
+    x = Output((), unit="m", doc="position")
+    acceleration = Output((), unit="m/s^2", doc="of the body")
+
+    def build_model(self):
+        x, v, force = ca.SX.sym("x"), ca.SX.sym("v"), ca.SX.sym("force")
+        k, m, x0 = ca.SX.sym("k"), ca.SX.sym("m"), ca.SX.sym("x0")
+        a = (force - k * x) / m
+        return Model(
+            "spring",
+            inputs={"force": force},
+            states={"x": x, "v": v},
+            parameters={"stiffness": k, "mass": m, "x0": x0},
+            derivatives={"x": v, "v": a},
+            initial={"x": x0},
+            outputs={"x": x, "acceleration": a},
+            step=ca.SX.sym("dt"),
+        )
