@@ -288,6 +288,8 @@ class _Fmi2(_Writer):
     def __init__(self, layout: Layout, files: Sequence[str]) -> None:
         super().__init__(layout)
         self._files = files
+        # FMI 2 needs no variable for the time, and FMI Library objects to it
+        self.variables = [v for v in self.variables if v.causality != "independent"]
         self._first: dict[int, int] = {}
         count = 1
         for variable in self.variables:
@@ -366,8 +368,6 @@ class _Fmi2(_Writer):
             if describe(variable):
                 attributes["description"] = describe(variable)
             attributes |= self.common(variable)
-            if variable.causality == "independent":
-                attributes.pop("initial", None)
             element = ET.Element("ScalarVariable", attributes)
             typed = self.bounds(variable)
             if variable.kind == "integer":
@@ -380,9 +380,9 @@ class _Fmi2(_Writer):
             if unit not in ("", "1"):
                 typed["unit"] = unit
             declared = self.type_name(variable)
-            if declared is not None and variable.causality != "independent":
+            if declared is not None:
                 typed["declaredType"] = declared
-            if starts and variable.causality != "independent":
+            if starts:
                 typed["start"] = number(starts[k])
             if variable.derivative_of is not None:
                 typed["derivative"] = str(self._first[id(variable.derivative_of)] + k)
