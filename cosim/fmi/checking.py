@@ -143,6 +143,6 @@ def _validated(path: str | Path) -> list[str]:
     from fmpy.validation import validate_fmu
 
     try:
-        return [str(problem) for problem in validate_fmu(str(path))]
+        return [str(problem).strip().splitlines()[0] for problem in validate_fmu(str(path))]
     except Exception as error:  # FMPy raises many types for what it cannot read
         return [str(error)]

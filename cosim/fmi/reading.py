@@ -193,7 +193,7 @@ def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list
             if variable.causality in ("input", "output"):
                 left_out.append(variable.name)
             continue
-        match = _ELEMENT.match(variable.name) if arrays and archive.version == 2 else None
+        match = None if not arrays or variable.dimensions else _ELEMENT.match(variable.name)
         name = match[1] if match else variable.name
         index = tuple(int(i) for i in match[2].split(",")) if match else ()
         groups.setdefault((name, variable.causality), []).append((index, variable))

@@ -100,6 +100,8 @@ class Integrator:
             If the FMU or the solver fails.
         """
         end = t + h
+        if self._next_event is not None and abs(self._next_event - end) <= 1e-9 * h:
+            end = self._next_event  # the same moment, added up in another way
         if self._stale and self._cvode is not None:
             self._cvode.reset(t)
             self._stale = False

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from terrafix.cosim.system import System
 
 FAILED, REFUSED = 1, 2
+MOST_SHOWN = 6  # findings of one check
 FIGURES = (".png", ".svg", ".pdf")
 DIAGRAMS = (".svg", ".png", ".mmd")
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -416,7 +417,13 @@ def check_fmu_command(file: str, as_json: bool) -> int:
     else:
         kinds = " and ".join(report.kinds)
         _show(f"{report.model}: FMI {report.fmi}, {kinds}; checked: {', '.join(report.checks)}")
+        shown: dict[str, int] = {}
         for found in [*report.findings, *report.notes]:
+            shown[found.check] = shown.get(found.check, 0) + 1
+            if shown[found.check] == MOST_SHOWN + 1:
+                print(f"  more of '{found.check}': --json lists all")
+            if shown[found.check] > MOST_SHOWN:
+                continue
             print(f"{found.severity}: {found.check}: {found.where}: {found.what}")
             if found.why:
                 print(f"  {found.why}")

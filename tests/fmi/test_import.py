@@ -1,0 +1,303 @@
+"""Imported FMUs: ports, members, state, other people's exporters, and foreign code that fails."""
+
+from __future__ import annotations
+
+import textwrap
+import zipfile
+
+import fmu_parts
+import numpy as np
+import pytest
+from fmu_helpers import OPEN_LOOP, broken
+
+from terrafix.cosim.clock import Rate
+from terrafix.cosim.errors import ConfigurationError, StepError, SystemCheckError, WiringError
+from terrafix.cosim.fmi import fleet
+from terrafix.cosim.fmi.binding import MODEL_EXCHANGE
+from terrafix.cosim.fmi.component import Fmu
+from terrafix.cosim.fmi.export import export_fmu
+from terrafix.cosim.run import RunError, simulate
+from terrafix.cosim.simulation import Simulation
+from terrafix.cosim.system import System
+
+
+def alone(fmu, name="part"):
+    system = System("alone")
+    system.add(fmu, name)
+    return system
+
+
+def outputs(system, t, path, members=1):
+    simulation = Simulation(system, members=members)
+    simulation.run_until(t)
+    found = simulation.master.wiring.slots[path].data.copy()
+    simulation.master.terminate()
+    return found
+
+
+@pytest.fixture(scope="module")
+def ramp(tmp_path_factory):
+    """An FMU of another exporter, with Python inside."""
+    pythonfmu = pytest.importorskip("pythonfmu.builder")
+    folder = tmp_path_factory.mktemp("ramp")
+    (folder / "ramp.py").write_text(
+        textwrap.dedent(
+            """
+            from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real
+
+            class Ramp(Fmi2Slave):
+                def __init__(self, **kwargs):
+                    super().__init__(**kwargs)
+                    self.u, self.y, self.k, self.n = 2.0, 1.0, 0.5, 0
+                    self.register_variable(Real("u", causality=Fmi2Causality.input))
+                    self.register_variable(Real("y", causality=Fmi2Causality.output))
+                    self.register_variable(Integer("n", causality=Fmi2Causality.output))
+                    self.register_variable(Real("k", causality=Fmi2Causality.parameter,
+                                                variability=Fmi2Variability.tunable))
+                def do_step(self, t, h):
+                    self.y += h * self.k * self.u
+                    self.n += 1
+                    return True
+            """
+        )
+    )
+    return pythonfmu.FmuBuilder.build_FMU(folder / "ramp.py", dest=folder)
+
+
+# ------------------------------------------------------------------ what the description says
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_ports_units_and_start_values(spring, fmi):
+    fmu = alone(Fmu(file=spring(fmi), rate=Rate("0.01"))).nodes["part"]
+    ports = {n: (p.is_input, p.single.shape, p.single.unit, p.at) for n, p in fmu.ports.items()}
+    assert ports == {
+        "force": (True, (), "N", "end"),
+        "x": (False, (), "m", "end"),
+        "acceleration": (False, (), "m/s^2", "end"),
+    }
+    assert float(fmu.ports["force"].default) == 0.25
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_messages_frames_and_bundles_come_back(exported, fmi):
+    fmu = alone(Fmu(file=exported("correct", fmi))).nodes["part"]
+    native = System.from_file(OPEN_LOOP).nodes["correct"]
+    for name, port in native.ports.items():
+        other = fmu.ports[name]
+        assert (port.kind, port.is_input, port.at) == (other.kind, other.is_input, other.at)
+        for key, field in port.fields.items():
+            found = other.fields[key]
+            assert (field.shape, field.frame, field.unit) == (found.shape, found.frame, found.unit)
+
+
+def test_parameters_and_start_values_are_set_with_units(spring):
+    start = {"mass": "3000 g", "x0": "12 cm", "force": "0.5 N"}
+    native = fmu_parts.Spring(mass=3.0, x0=0.12)
+    with System("native") as system:
+        part = system.add(native, "spring")
+    part.ports["force"].default = 0.5
+    try:
+        expected = outputs(system, "0.2", "spring.x")
+    finally:
+        part.ports["force"].default = 0.25
+    found = outputs(alone(Fmu(file=spring(3), rate=Rate("0.01"), start=start)), "0.2", "part.x")
+    assert np.array_equal(found, expected)
+
+
+def test_a_foreign_fmu_reads_at_the_start_and_its_period_is_found(ramp):
+    fmu = Fmu(file=ramp, rate=Rate("0.1"), start={"k": 2.0, "u": 3.0})
+    system = alone(fmu)
+    assert fmu.ports["u"].at == "start"
+    assert fmu.ports["n"].single.dtype == np.int64
+    assert outputs(system, "1", "part.y") == pytest.approx(1 + 10 * 0.1 * 2 * 3)
+
+
+def test_driver_and_ctypes_give_the_same(spring, monkeypatch):
+    driven = outputs(alone(Fmu(file=spring(3), rate=Rate("0.01"))), "1", "part.x", members=3)
+    monkeypatch.setattr(fleet, "_driver", lambda: None)
+    for fmi in (2, 3):
+        plain = outputs(alone(Fmu(file=spring(fmi), rate=Rate("0.01"))), "1", "part.x", members=3)
+        assert np.array_equal(driven, plain)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize(("solver", "error"), [("cvode", 1e-7), ("dop853", 1e-9)])
+def test_model_exchange_against_the_closed_form(spring, fmi, solver, error):
+    fmu = Fmu(file=spring(fmi), kind=MODEL_EXCHANGE, solver=solver, rate=Rate("0.1"))
+    x = outputs(alone(fmu), "3", "part.x")
+    w, rest = np.sqrt(4.0 / 1.5), 0.25 / 4.0
+    assert x == pytest.approx(rest + (0.3 - rest) * np.cos(3 * w), abs=error)
+
+
+def test_a_ring_of_integrators(tmp_path):
+    """y = 1.01^100 where initial outputs reach the inputs, 1.01^99 where start values are held."""
+    export_fmu(fmu_parts.EulerIntegrator(), tmp_path / "integrator.fmu", fmi=2)
+    for held, power in ((False, 100), (True, 99)):
+        with System("ring") as ring:
+            for name in "abc":
+                file = tmp_path / "integrator.fmu"
+                ring.add(Fmu(file=file, rate=Rate("0.01"), hold_start_values=held), name)
+            for source, target in ("ab", "bc", "ca"):
+                ring.connect(f"{source}.y", f"{target}.u")
+        assert outputs(ring, "1", "a.y") == pytest.approx(1.01**power, rel=1e-12)
+
+
+# ------------------------------------------------------------------ ensembles and state
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_a_run_with_fmus_resumes_to_the_same_bytes(exported, tmp_path, isolate):
+    def system():
+        made = System.from_file(OPEN_LOOP)
+        for name in ("orbit", "imu", "predict", "correct"):
+            fmu = Fmu(file=exported(name, 3), rate=made.nodes[name].rate, isolate=isolate)
+            made.replace(name, fmu)
+        return made
+
+    whole = simulate(system(), members=2, duration="24.6", out=tmp_path / "whole.nc")
+    part = simulate(
+        system(), members=2, duration="16.4", checkpoint_every="8.2", out=tmp_path / "part.nc"
+    )
+    del part
+    checkpoint = next(tmp_path.glob("part*.ckpt"))
+    resumed = simulate(
+        system(), members=2, duration="24.6", resume=checkpoint, out=tmp_path / "resumed.nc"
+    )
+    for variable in ("orbit.r_e", "correct.estimate.r_e", "correct.estimate.P"):
+        a, b = whole.dataset[variable], resumed.dataset[variable]
+        assert np.array_equal(a, b), variable
+
+
+def test_an_fmu_without_state_says_so(ramp, tmp_path):
+    with pytest.raises(Exception, match=r"'part' \(Fmu\) cannot save its state"):
+        simulate(alone(Fmu(file=ramp, rate=Rate("0.1"))), duration="1", checkpoint_every="0.5",
+                 out=tmp_path / "x.nc")  # fmt: skip
+
+
+def test_isolated_gives_the_same_bytes(exported):
+    found = []
+    for isolate in (False, True):
+        system = System.from_file(OPEN_LOOP)
+        for name in ("orbit", "sar"):
+            fmu = Fmu(file=exported(name, 2), rate=system.nodes[name].rate, isolate=isolate)
+            system.replace(name, fmu)
+        found.append(simulate(system, members=2, duration="16.4").dataset["correct.estimate.r_e"])
+    assert np.array_equal(*found)
+
+
+# ------------------------------------------------------------------ foreign code that fails
+
+_AT_ONE = ("core.c", "    return step_to(i, now->tick + (int64_t)count);")
+
+
+def failing(spring, tmp_path, statement, fmi=3):
+    """The spring with something done when a step from t = 0.05 s is asked for."""
+    file, line = _AT_ONE
+    body = f"    if (t > 0.045) {{ {statement} }}\n{line}"
+    return broken(spring(fmi), tmp_path / "failing.fmu", patches=[(file, line, body)])
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_fmu_that_returns_an_error(spring, tmp_path, fmi):
+    file = failing(spring, tmp_path, 'return fail(i, "the spring broke");', fmi)
+    system = alone(Fmu(file=file, rate=Rate("0.01")))
+    system.record("history", ["part.x"])
+    with pytest.raises(RunError, match="DoStep did not succeed: the spring broke") as raised:
+        simulate(system, duration="0.1")
+    assert "t = 0.06 s" in str(raised.value)
+    assert len(raised.value.result.dataset["part.x"].values[0]) >= 5  # records are kept
+
+
+def test_one_member_that_fails_is_excluded(spring, tmp_path):
+    line = _AT_ONE[1]
+    body = f'    if (strchr(i->name, \'1\') && t > 0.045) return fail(i, "no");\n{line}'
+    file = broken(spring(2), tmp_path / "one.fmu", patches=[("core.c", line, body)])
+    result = simulate(alone(Fmu(file=file, rate=Rate("0.01"))), members=3, duration="0.1")
+    assert [(e["member"], e["t_s"]) for e in result.excluded] == [(1, 0.06)]
+
+
+def test_an_fmu_that_diverges_to_nan(spring, tmp_path):
+    line = "    return step_to(i, now->tick + (int64_t)count);"
+    body = "    enum status s = step_to(i, now->tick + (int64_t)count);\n" \
+           "    if (t > 0.045) now->real[2] = 0.0 / 0.0;\n    return s;"  # fmt: skip
+    file = broken(spring(3), tmp_path / "nan.fmu", patches=[("core.c", line, body)])
+    with pytest.raises(RunError, match=r"failed in 'part': an output is not finite"):
+        simulate(alone(Fmu(file=file, rate=Rate("0.01"))), duration="0.1")
+
+
+def test_an_fmu_that_crashes_ends_its_component_and_not_the_run(spring, tmp_path):
+    file = failing(spring, tmp_path, "*(volatile int *)0 = 1;")
+    system = alone(Fmu(file=file, rate=Rate("0.01"), isolate=True))
+    system.record("history", ["part.x"])
+    with pytest.raises(RunError, match=r"crashed its process \(signal 11\)") as raised:
+        simulate(system, duration="0.1")
+    assert len(raised.value.result.dataset["part.x"].values[0]) >= 5
+
+
+def test_an_fmu_that_hangs(spring, tmp_path):
+    file = failing(spring, tmp_path, "for (volatile int k = 0;; k++) ;")
+    system = alone(Fmu(file=file, rate=Rate("0.01"), isolate=True, time_limit=1.0))
+    with pytest.raises(StepError, match=r"did not answer within 1 s"):
+        simulate(system, duration="0.1")
+
+
+# ------------------------------------------------------------------ bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"start": {"mas": "1 kg"}}, r"has no parameter or input 'mas'\n  did you mean 'mass'\?"),
+        ({"start": {"mass": "1 m"}}, r"'part.start.mass' is given in m; it takes number \[kg\]"),
+        ({"start": {"mass": [1.0, 2.0]}}, r"'part.start.mass' has shape \(2,\)"),
+        ({"units": {"y": "m"}}, r"'part.units' names 'y', which is no port"),
+        ({"units": {"x": "km"}}, r"says km for 'x', the FMU says m"),
+        ({"frames": {"z": "e"}}, r"'part.frames' names 'z', which is no port"),
+        ({"kind": "model exchange", "solver": "euler"}, r"it takes \"cvode\" or \"dop853\""),
+    ],
+)
+def test_settings_that_do_not_fit(spring, options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        alone(Fmu(file=spring(2), rate=Rate("0.01"), **options))
+
+
+def test_a_rate_that_does_not_fit(spring):
+    with pytest.raises(SystemCheckError, match=r"its FMU takes multiples of 0.01 s"):
+        Simulation(alone(Fmu(file=spring(3), rate=Rate("0.015"))))
+
+
+def test_units_and_shapes_at_a_connection(spring, exported):
+    with System("wrong") as system:
+        system.add(Fmu(file=spring(2), rate=Rate("0.01")), "spring")
+        system.add(Fmu(file=exported("orbit", 2), rate=Rate("0.01")), "orbit")
+    with pytest.raises(WiringError, match=r"the units differ: m is not N"):
+        system.connect("spring.x", "spring.force")
+    with pytest.raises(WiringError, match=r"the shapes differ: \(3,\) is not \(\)"):
+        system.connect("orbit.r_e", "spring.force")
+    with pytest.raises(WiringError, match=r"has no port 'velocity'"):
+        system.connect("orbit.velocity", "spring.force")
+
+
+def test_co_simulation_that_is_not_offered(exported, tmp_path):
+    with pytest.raises(ConfigurationError, match=r"offers co-simulation, not model exchange"):
+        alone(Fmu(file=exported("imu", 3), kind=MODEL_EXCHANGE))
+
+
+def test_a_binary_of_another_platform(spring, tmp_path):
+    target = tmp_path / "foreign.fmu"
+    with zipfile.ZipFile(spring(2)) as archive, zipfile.ZipFile(target, "w") as out:
+        for name in archive.namelist():
+            data = archive.read(name)
+            out.writestr(name.replace("linux64", "win64").replace(".so", ".dll"), data)
+    with pytest.raises(ConfigurationError, match=r"no binary for this machine, linux64; it has win64"):
+        alone(Fmu(file=target))
+
+
+def test_a_binary_without_the_functions(spring, tmp_path):
+    target = tmp_path / "empty.fmu"
+    with zipfile.ZipFile(spring(2)) as archive, zipfile.ZipFile(target, "w") as out:
+        for name in archive.namelist():
+            out.writestr(name, b"no library" if name.endswith(".so") else archive.read(name))
+    with pytest.raises((RunError, ConfigurationError, StepError), match="cannot be loaded"):
+        simulate(alone(Fmu(file=target, rate=Rate("0.01"))), duration="0.1")
