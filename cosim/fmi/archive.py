@@ -7,6 +7,7 @@ import shutil
 import stat
 import tempfile
 import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -132,7 +133,7 @@ def unpack(file: Path, folder: Path, what: str = "FMU") -> None:
             f"'{file}' is no {what}: {str(error)[0].lower()}{str(error)[1:]}\n"
             f"  an {what} is a zip archive; it may have been cut short"
         ) from error
-    except (OSError, EOFError, NotImplementedError, RuntimeError) as error:
+    except (OSError, EOFError, NotImplementedError, RuntimeError, zlib.error) as error:
         raise ConfigurationError(f"cannot unpack '{file}': {error}") from error
 
 

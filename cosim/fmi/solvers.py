@@ -78,9 +78,17 @@ class Integrator:
         self._fmu.call("EnterContinuousTimeMode")
 
     def _handle(self, t: float) -> None:
+        """Handle events; the solver goes on as it was where the equations did not change."""
+        before = self._moment()
         self._fmu.call("EnterEventMode")
         self._events(t)
-        self.restart(t)
+        if not np.array_equal(before, self._moment()):
+            self.restart(t)
+
+    def _moment(self) -> FloatArray:
+        """Continuous states and their derivatives, now."""
+        states = self._fmu.get_vector("GetContinuousStates", self._n)
+        return np.concatenate([states, self._fmu.rates(self._n)])
 
     def restart(self, t: float | None = None) -> None:
         """Begin anew from the present states."""
