@@ -187,7 +187,7 @@ def check_start(subject: Subject) -> Iterator[Finding]:
                 "start",
                 ERROR,
                 v.name,
-                f"the description says {stated[k]!r}, the binary has {got[k]!r}{digits}",
+                f"the description says {float(stated[k])!r}, the binary has {float(got[k])!r}{digits}",
                 "who shows or copies the start values of the description gets other results",
             )
     finally:

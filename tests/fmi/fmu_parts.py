@@ -12,21 +12,26 @@ from terrafix.models.model import Model
 
 
 class EulerIntegrator(SymbolicComponent):
-    """x' = u by the explicit Euler method, y = x + 1."""
+    """x' = u + drive by the explicit Euler method, y = x + shift."""
 
     default_rate = Rate("0.01")
 
+    shift = Parameter(1.0, doc="of the output")
+    drive = Parameter(0.0, doc="added to the input")
+
     u = Input((), unit="1", at="start", default=0.0, doc="derivative")
-    y = Output((), unit="1", doc="state plus one")
+    y = Output((), unit="1", doc="state plus shift")
 
     def build_model(self):
         x, u, dt = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("dt")
+        shift, drive = ca.SX.sym("shift"), ca.SX.sym("drive")
         return Model(
             "integrator",
             inputs={"u": u},
             states={"x": x},
-            next={"x": x + dt * u},
-            outputs={"y": x + 1},
+            parameters={"shift": shift, "drive": drive},
+            next={"x": x + dt * (u + drive)},
+            outputs={"y": x + shift},
             step=dt,
         )
 
