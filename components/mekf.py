@@ -42,9 +42,7 @@ class MekfPredict(SymbolicComponent):
     )
     misalignment_sigma0 = Parameter(unit="rad", positive=True, doc="at t = 0, per axis")
 
-    start = MessageInput(
-        fields=KNOWN_STATE, needed_at_start=True, doc="last known state, at t = 0"
-    )
+    start = MessageInput(fields=KNOWN_STATE, needed_at_start=True, doc="last known state, at t = 0")
     posterior = MessageInput(fields=ESTIMATE, at="start", doc="corrected estimate")
     delta_v_b = Input((3,), unit="m/s", frame="b", doc="measured velocity increment")
     q_be = Input((4,), unit="1", frame="b", doc="measured attitude, Earth-fixed to body")

@@ -11,6 +11,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import date, time
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar, overload
@@ -309,10 +310,8 @@ class Table(Setting[dict[str, Any]]):
         if isinstance(value, str):
             import tomllib
 
-            try:
+            with suppress(tomllib.TOMLDecodeError):
                 value = tomllib.loads(f"table = {value}")["table"]
-            except tomllib.TOMLDecodeError:
-                pass
         if not isinstance(value, dict):
             raise ConfigurationError(
                 f'{where} is {shown(value)}; it takes a table: write {{ name = "1.0 m" }}'

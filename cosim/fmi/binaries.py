@@ -16,7 +16,6 @@ from pathlib import Path
 from terrafix.cosim.errors import ConfigurationError, nearest
 from terrafix.cosim.toolchain import FLAGS, working_compiler
 
-
 LONG = 150_000  # characters of C
 
 
@@ -86,7 +85,9 @@ def chosen_platforms(text: str) -> tuple[Platform | None, ...]:
             )
         chosen.append(None if name == "host" else PLATFORMS[name])
     if not chosen:
-        raise ConfigurationError(f"no platform is named\n  platforms: host, all, {', '.join(PLATFORMS)}")
+        raise ConfigurationError(
+            f"no platform is named\n  platforms: host, all, {', '.join(PLATFORMS)}"
+        )
     return tuple(dict.fromkeys(chosen))
 
 
@@ -158,9 +159,7 @@ def _compile(
     _run([*words, "-c", name, "-o", _object(name, target)], folder, target)
 
 
-def _link(
-    folder: Path, names: Sequence[str], target: Platform, command: Sequence[str]
-) -> bytes:
+def _link(folder: Path, names: Sequence[str], target: Platform, command: Sequence[str]) -> bytes:
     library = folder / f"{target.name}{target.suffix}"
     words = [*command, "-shared", *(_object(n, target) for n in names), "-o", library.name]
     words += ["-s"] if target.suffix != ".dylib" else []

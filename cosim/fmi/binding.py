@@ -87,16 +87,20 @@ def _note(environment: int | None, category: bytes | None, text: bytes | None) -
     del category
 
 
-@ct.CFUNCTYPE(None, ct.c_void_p, ct.c_char_p, ct.c_int, ct.c_char_p, ct.c_char_p)
-def _log2(environment: Any, name: Any, status: Any, category: Any, text: Any) -> None:
+def _log_of_fmi2(environment: Any, name: Any, status: Any, category: Any, text: Any) -> None:
     del name, status
     _note(environment, category, text)
 
 
-@ct.CFUNCTYPE(None, ct.c_void_p, ct.c_int, ct.c_char_p, ct.c_char_p)
-def _log3(environment: Any, status: Any, category: Any, text: Any) -> None:
+def _log_of_fmi3(environment: Any, status: Any, category: Any, text: Any) -> None:
     del status
     _note(environment, category, text)
+
+
+_log2 = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_char_p, ct.c_int, ct.c_char_p, ct.c_char_p)(
+    _log_of_fmi2
+)
+_log3 = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_int, ct.c_char_p, ct.c_char_p)(_log_of_fmi3)
 
 
 def _callbacks2(environment: int) -> Any:
@@ -138,7 +142,9 @@ class Library:
             os.chdir(path.parent)  # what it needs may lie beside it
             self._dll = ct.CDLL(str(path))
         except OSError as error:
-            raise ConfigurationError(f"the binary of '{archive.path}' cannot be loaded: {error}") from error
+            raise ConfigurationError(
+                f"the binary of '{archive.path}' cannot be loaded: {error}"
+            ) from error
         finally:
             os.chdir(here)
 
@@ -252,7 +258,9 @@ class Instance:
             self.call("EnterInitializationMode")
         else:
             defined = ct.c_bool(stop is not None)
-            self.call("EnterInitializationMode", ct.c_bool(False), ct.c_double(0.0), time, defined, end)
+            self.call(
+                "EnterInitializationMode", ct.c_bool(False), ct.c_double(0.0), time, defined, end
+            )
 
     def finish(self) -> None:
         """Leave initialization mode."""
@@ -294,8 +302,8 @@ class Instance:
         """Set variables of one type."""
         name, ctype = self._type(kind)
         flat = np.asarray(values).ravel().tolist()
-        converted = [ctype(int(v) if "double" not in ctype.__name__ and "float" not in ctype.__name__
-                           else v).value for v in flat]  # fmt: skip
+        convert: Any = float if ctype in (ct.c_double, ct.c_float) else int
+        converted = [convert(value) for value in flat]
         array = (ctype * max(len(flat), 1))(*converted)
         sizes = () if self._version == 2 else (ct.c_size_t(len(flat)),)
         self.call(f"Set{name}", vr, ct.c_size_t(len(vr)), array, *sizes)
@@ -390,7 +398,9 @@ class Instance:
             else:
                 flags = [ct.c_bool() for _ in range(5)]
                 next_time = ct.c_double()
-                self.call("UpdateDiscreteStates", *(ct.byref(f) for f in flags), ct.byref(next_time))
+                self.call(
+                    "UpdateDiscreteStates", *(ct.byref(f) for f in flags), ct.byref(next_time)
+                )
                 again, end = flags[0].value, flags[1].value
                 changed |= bool(flags[3].value)
                 defined, time = flags[4].value, next_time.value
@@ -426,4 +436,6 @@ class Instance:
 
     def rates(self, n: int) -> FloatArray:
         """Derivatives of the continuous states."""
-        return self.get_vector("GetDerivatives" if self._version == 2 else "GetContinuousStateDerivatives", n)
+        return self.get_vector(
+            "GetDerivatives" if self._version == 2 else "GetContinuousStateDerivatives", n
+        )

@@ -99,8 +99,11 @@ def check_fmu(
     """
     archive = open_archive(path)
     description = archive.description
-    kinds = [k for k, i in ((CO_SIMULATION, description.coSimulation),
-                            (MODEL_EXCHANGE, description.modelExchange)) if i is not None]  # fmt: skip
+    offered = {
+        CO_SIMULATION: description.coSimulation,
+        MODEL_EXCHANGE: description.modelExchange,
+    }
+    kinds = [kind for kind, interface in offered.items() if interface is not None]
     report = Report(Path(path), archive.version, description.modelName or "", tuple(kinds))
     report.checks.append("description")
     for problem in _validated(path):

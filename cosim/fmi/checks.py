@@ -139,9 +139,7 @@ def _scalars(variable: Any) -> Scalars:
     if variable.start is not None and variable.type in (*REAL, *INTEGER, *BOOLEAN):
         text = variable.start
         words = text.split() if isinstance(text, str) else [str(x) for x in np.ravel(text)]
-        start = tuple(
-            1.0 if w == "true" else 0.0 if w == "false" else float(w) for w in words
-        )
+        start = tuple(1.0 if w == "true" else 0.0 if w == "false" else float(w) for w in words)
         if len(start) == 1 and size > 1:
             start *= size
 
@@ -187,7 +185,8 @@ def check_start(subject: Subject) -> Iterator[Finding]:
                 "start",
                 ERROR,
                 v.name,
-                f"the description says {float(stated[k])!r}, the binary has {float(got[k])!r}{digits}",
+                f"the description says {float(stated[k])!r}, "
+                f"the binary has {float(got[k])!r}{digits}",
                 "who shows or copies the start values of the description gets other results",
             )
     finally:
@@ -195,7 +194,7 @@ def check_start(subject: Subject) -> Iterator[Finding]:
 
 
 def check_run(subject: Subject) -> Iterator[Finding]:
-    """Does it start and step with its own start values, and give finite outputs?"""
+    """It must start and step with its own start values, and give finite outputs."""
     instance = subject.started()
     try:
         if subject.kind == CO_SIMULATION:
@@ -233,7 +232,9 @@ def check_state(subject: Subject) -> Iterator[Finding]:
             yield _different("state", subject, first, again, "after its state was set back",
                              "a master that repeats steps gets other results")  # fmt: skip
         if not subject.interface.canSerializeFMUstate:
-            yield Finding("state", NOTE, "canSerializeFMUState", "its state cannot be kept as bytes")
+            yield Finding(
+                "state", NOTE, "canSerializeFMUState", "its state cannot be kept as bytes"
+            )
             return
         restarted = subject.started()
         try:
@@ -271,7 +272,7 @@ def check_reset(subject: Subject) -> Iterator[Finding]:
             again = subject.get(instance, subject.outputs())
         if not np.array_equal(first, again, equal_nan=True):
             yield _different("reset", subject, first, again, "after a reset",
-                             "a campaign that resets instead of instantiating is wrong")  # fmt: skip
+                             "a campaign that resets its instances is wrong")  # fmt: skip
     finally:
         instance.free()
 
@@ -340,7 +341,9 @@ def check_step_size(subject: Subject) -> Iterator[Finding]:
     internal = getattr(subject.interface, "fixedInternalStepSize", None)
     cases = [("a negative step", -subject.h), ("a step of NaN", math.nan)]
     if internal:
-        cases.append((f"a step that is no multiple of {float(internal):g} s", 0.37 * float(internal)))
+        cases.append(
+            (f"a step that is no multiple of {float(internal):g} s", 0.37 * float(internal))
+        )
     for what, h in cases:
         instance = subject.started()
         try:
@@ -422,7 +425,7 @@ def _derivatives_of_steps(subject: Subject) -> Iterator[Finding]:
     """Outputs by inputs: at once, or through the step that the inputs were set for."""
     stated_for = _stated(subject.description.outputs)
     outputs = subject.outputs()
-    inputs = [v for v in subject.reals("input")]
+    inputs = subject.reals("input")
     if not inputs or not outputs:
         return
     instance = subject.started()
@@ -496,7 +499,9 @@ def _compared(
     if not wrong.any():
         return
     row = int(np.argmax(np.abs(stated - difference)))
-    names = [f"{u.name}[{k + 1}]" if u.size > 1 else u.name for u in unknowns for k in range(u.size)]
+    names = [
+        f"{u.name}[{k + 1}]" if u.size > 1 else u.name for u in unknowns for k in range(u.size)
+    ]
     by = f"{known.name}[{element + 1}]" if known.size > 1 else known.name
     yield Finding(
         check,
@@ -613,9 +618,7 @@ def run_check(file: str, kind: str, name: str) -> list[Finding]:
             if len(found) >= 20:
                 break
     except FmuError as error:
-        found.append(
-            Finding(name, ERROR, kind, str(error), "an importer meets the same refusal")
-        )
+        found.append(Finding(name, ERROR, kind, str(error), "an importer meets the same refusal"))
     return found
 
 

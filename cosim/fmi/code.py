@@ -234,9 +234,7 @@ def _call(name: str, call: Call) -> str:
 
 def _copies(name: str, copies: Sequence[Copy]) -> list[str]:
     lines = [
-        _numbers("double", f"{name}_factor{k}", c.factor)
-        for k, c in enumerate(copies)
-        if c.factor
+        _numbers("double", f"{name}_factor{k}", c.factor) for k, c in enumerate(copies) if c.factor
     ]
     lines.append(f"static const struct copy {name}[] = {{")
     for k, c in enumerate(copies):

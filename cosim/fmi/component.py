@@ -354,7 +354,8 @@ class Fmu(Component):
                 continue
             rows = np.flatnonzero(view.fresh)
             values = [(q, view.slot.views[n]) for n, (q, _) in port.fields.items()]
-            assert port.t is not None and port.sequence is not None
+            assert port.t is not None
+            assert port.sequence is not None
             values += [(port.t, view.t), (port.sequence, view.sequence)]
             for quantity, array in values:
                 chosen = np.asarray(array[rows], dtype=np.float64).reshape(len(rows), -1)

@@ -105,48 +105,44 @@ class _Quick:
         name = "Real" if library.version == 2 else "Float64"
         self._instance = instance
         self._t, self._h = ct.c_double(), ct.c_double()
-        self._row = fleet.outputs[row]
-        self._zeros = np.zeros_like(self._row)
-        self._kept = [ct.c_bool() for _ in range(3)], ct.c_double()
-        self._calls = []
-        for function, group, rows in (
-            (f"Set{name}", fleet.setup.inputs, fleet.inputs),
-            (f"Get{name}", fleet.setup.outputs, fleet.outputs),
-        ):
+        output = fleet.outputs[row]
+        self._dot, self._zeros = output.dot, np.zeros_like(output)
+
+        def prepared(function: str, group: tuple[Group, ...], rows: FloatArray) -> tuple[Any, Any]:
             if not group:
-                self._calls.append(None)
-                continue
+                return None, ()
             vr = fleet._references[group[0]]
-            n = rows.shape[1]
             where = ct.c_void_p(rows[row].ctypes.data)
             arguments = [instance.pointer, vr, ct.c_size_t(len(vr)), where]
-            arguments += [] if library.version == 2 else [ct.c_size_t(n)]
+            arguments += [] if library.version == 2 else [ct.c_size_t(rows.shape[1])]
             called = library[function]
             called.restype = ct.c_int
-            self._calls.append((called, tuple(arguments)))
-        step = library["DoStep"]
-        step.restype = ct.c_int
-        flags, last = self._kept
-        after = (1,) if library.version == 2 else (
-            ct.c_bool(True), *(ct.byref(f) for f in flags), ct.byref(last)
-        )  # fmt: skip
-        self._step = step, (instance.pointer, self._t, self._h, *after)
-        self._early = () if library.version == 2 else tuple(flags[1:])
+            return called, tuple(arguments)
+
+        self._set, self._set_arguments = prepared(f"Set{name}", fleet.setup.inputs, fleet.inputs)
+        self._get, self._get_arguments = prepared(f"Get{name}", fleet.setup.outputs, fleet.outputs)
+        self._step = library["DoStep"]
+        self._step.restype = ct.c_int
+        flags, last = [ct.c_bool() for _ in range(3)], ct.c_double()
+        after: tuple[Any, ...] = (1,)
+        self._ended: tuple[Any, Any] | None = None
+        if library.version == 3:
+            after = (ct.c_bool(True), *(ct.byref(f) for f in flags), ct.byref(last))
+            self._ended = flags[1], flags[2]
+        self._step_arguments = (instance.pointer, self._t, self._h, *after)
 
     def __call__(self, t: float, h: float) -> None:
         self._t.value, self._h.value = t, h
-        before, after = self._calls
-        if before is not None and before[0](*before[1]) > 1:
+        if self._set is not None and self._set(*self._set_arguments) > 1:
             raise FmuError(f"{_REASONS[1]}{self._instance.said()}")
-        step, arguments = self._step
-        if step(*arguments) > 1:
+        if self._step(*self._step_arguments) > 1:
             raise FmuError(f"{_REASONS[2]}{self._instance.said()}")
-        if any(flag.value for flag in self._early):
+        if self._ended is not None and (self._ended[0].value or self._ended[1].value):
             raise FmuError(_REASONS[5])
-        if after is not None:
-            if after[0](*after[1]) > 1:
+        if self._get is not None:
+            if self._get(*self._get_arguments) > 1:
                 raise FmuError(f"{_REASONS[3]}{self._instance.said()}")
-            if self._row.dot(self._zeros) != 0.0:  # NaN: something is not finite
+            if self._dot(self._zeros) != 0.0:  # NaN: something is not finite
                 raise FmuError("an output is not finite")
 
 
@@ -193,6 +189,7 @@ class Fleet:
 
     def __init__(self, setup: Setup, n_members: int) -> None:
         self._quick: dict[int, _Quick] = {}
+        self._live: list[int] = []
         self.setup = setup
         self.archive = open_archive(setup.file)
         self.library = load_library(self.archive, setup.kind)
@@ -223,6 +220,7 @@ class Fleet:
                 self._failed[row] = _STEP
                 failures[row] = str(error)
         self._active[:] = active
+        self._live = self._find_live()
         self._prepare_calls()
         return failures
 
@@ -308,8 +306,29 @@ class Fleet:
 
         `skipped` are rows that are not stepped any more.
         """
-        for row in skipped:
-            self._active[row] = 0
+        if skipped:
+            self._active[list(skipped)] = 0
+            self._live = self._find_live()
+        failures = self._send(messages) if messages else {}
+        if self._drive is not None:
+            step, b, reference, _ = self._drive
+            b.t, b.h = t, h
+            return failures | self._explain() if step(reference) else failures
+        for row in self._live:
+            try:
+                self._step_one(row, t, h)
+            except FmuError as error:
+                self._failed[row] = _STEP
+                failures[row] = str(error)
+        if failures:
+            self._live = self._find_live()
+        return failures
+
+    def _find_live(self) -> list[int]:
+        rows: list[int] = np.flatnonzero(self._active & (self._failed == 0)).tolist()
+        return rows
+
+    def _send(self, messages: Sequence[Message]) -> Failures:
         failures: Failures = {}
         for row in {int(r) for message in messages for r in message.rows}:
             instance = self.instances[row]
@@ -320,21 +339,11 @@ class Fleet:
             except FmuError as error:
                 self._failed[row] = _STEP
                 failures[row] = str(error)
-        if self._drive is not None:
-            step, b, reference, _ = self._drive
-            b.t, b.h = t, h
-            return failures | self._explain() if step(reference) else failures
-        for row in np.flatnonzero(self._active & (self._failed == 0)).tolist():
-            try:
-                self._step_one(row, t, h)
-            except FmuError as error:
-                self._failed[row] = _STEP
-                failures[row] = str(error)
         return failures
 
     def _step_one(self, row: int, t: float, h: float) -> None:
-        if row in self._quick:
-            self._quick[row](t, h)
+        if quick := self._quick.get(row):
+            quick(t, h)
             return
         instance = self.instances[row]
         assert instance is not None

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -288,7 +289,14 @@ class Layout:
         offset = self._keep_integer()
         self.start_integer[offset] = start or 0
         made = Variable(
-            name, "integer", causality, offset, (), start, discrete=causality != "parameter", **options
+            name,
+            "integer",
+            causality,
+            offset,
+            (),
+            start,
+            discrete=causality != "parameter",
+            **options,
         )
         self.integers.append(made)
         return made
@@ -429,7 +437,7 @@ class Layout:
             return
         import casadi as ca
 
-        path, component = components[0]
+        _, component = components[0]
         model = component.model
         taken = {v.name for v in self.reals}
         for name in model.derivatives:
@@ -504,10 +512,10 @@ class Layout:
         targets, published = self._targets(path, component)
         n_outputs = len(targets)
         targets += [Target(state + o, sizes[n]) for n, o in offsets.items()]
-        tail = [*parameters, *noise, *clock]
-        initial = Call(model.initial_function(f"{prefix}_initial"), [*inputs, *tail])
+        rest = [*parameters, *noise, *clock]
+        initial = Call(model.initial_function(f"{prefix}_initial"), [*inputs, *rest])
         states_before = [before + o for o in offsets.values()]
-        step = Call(model.step_function(f"{prefix}_step"), [*inputs, *states_before, *tail])
+        step = Call(model.step_function(f"{prefix}_step"), [*inputs, *states_before, *rest])
         n_in = len(inputs)
         by_parameter = list(range(n_in + len(parameters)))
         rate = component.rate
@@ -703,10 +711,7 @@ class Layout:
         return (
             [self._unknown(v, stepped, known) for v in outputs],
             [self._unknown(v, stepped, known) for v in rates],
-            [
-                self._unknown(v, started, exact)
-                for v in dict.fromkeys([*outputs, *states, *rates])
-            ],
+            [self._unknown(v, started, exact) for v in dict.fromkeys([*outputs, *states, *rates])],
         )
 
     def _row(self, variable: Variable) -> int:
@@ -773,9 +778,7 @@ class Layout:
                 rows = rows | sent[target.message]
             reach[target.offset : target.offset + target.size] = rows
 
-    def _unknown(
-        self, variable: Variable, reach: BoolArray, known: Sequence[Variable]
-    ) -> Unknown:
+    def _unknown(self, variable: Variable, reach: BoolArray, known: Sequence[Variable]) -> Unknown:
         row = self._row(variable) if variable.state is None else variable.state
         return Unknown(variable, list(known), reach[row : row + variable.size].copy())
 
@@ -811,7 +814,7 @@ def _forward(call: Call, name: str, by: Sequence[int], n_outputs: int) -> Call:
             ca.vertcat(*results), ca.vertcat(*(symbols[i] for i in by)), ca.vertcat(*seeds)
         )
         ends = np.cumsum([0] + [r.numel() for r in results]).tolist()
-        tangents = [ca.densify(tangent[a:b]) for a, b in zip(ends, ends[1:], strict=False)]
+        tangents = [ca.densify(tangent[a:b]) for a, b in pairwise(ends)]
     else:
         tangents = [ca.SX.zeros(r.numel()) for r in results]
     made = ca.Function(name, [*symbols, *seeds], tangents, {"cse": True})

@@ -6,16 +6,17 @@ import io
 import sys
 from html import escape
 from inspect import getdoc
+from typing import Any
 
 from terrafix.cosim.clock import text_seconds
 from terrafix.cosim.fmi.layout import Layout, Part
 from terrafix.cosim.fmi.variables import Variable
 
 _STYLE = (
-    "body{font:15px/1.5 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:#222}"
-    "table{border-collapse:collapse;width:100%}td,th{border-bottom:1px solid #ccd;padding:.3em .6em;"
-    "text-align:left;vertical-align:top}th{background:#f3f6f9}pre{background:#f3f6f9;padding:1em;"
-    "overflow-x:auto;white-space:pre-wrap}code{font-size:.95em}"
+    "body{font:15px/1.5 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;"
+    "color:#222}table{border-collapse:collapse;width:100%}td,th{border-bottom:1px solid #ccd;"
+    "padding:.3em .6em;text-align:left;vertical-align:top}th{background:#f3f6f9}"
+    "pre{background:#f3f6f9;padding:1em;overflow-x:auto;white-space:pre-wrap}code{font-size:.95em}"
 )
 
 
@@ -33,10 +34,10 @@ def page(layout: Layout) -> str:
     body += [f"<li><b>{escape(p.name)}</b> steps {escape(str(p.rate))}</li>" for p in layout.parts]
     body.append("</ul>")
     body.append(
-        "<p>Inputs <em>read at the end of a step</em> belong to the time the step ends: set them to "
-        "their value at t + h before the step from t to t + h, and the results are those of the "
-        "native component. A master that sets all inputs to their values at t delays each such link "
-        "by one step. Inputs <em>read at the start</em> belong to the time the step begins. "
+        "<p>Inputs <em>read at the end of a step</em> belong to the time the step ends: set them "
+        "to their value at t + h before the step from t to t + h, and the results are those of the "
+        "native component. A master that sets all inputs to their values at t delays each such "
+        "link by one step. Inputs <em>read at the start</em> belong to the time the step begins. "
         "A message is its fields, its time of validity <code>.t</code> and its number "
         "<code>.sequence</code>: a new number is a new message.</p>"
     )
@@ -117,7 +118,7 @@ def icon(layout: Layout) -> bytes:
     return buffer.getvalue()
 
 
-def _box() -> object:
+def _box() -> Any:
     from matplotlib.patches import FancyBboxPatch
 
     return FancyBboxPatch(

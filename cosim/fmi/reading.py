@@ -23,7 +23,10 @@ from terrafix.cosim.units import check_unit
 
 REAL = ("Real", "Float64", "Float32")
 BOOLEAN = ("Boolean",)
-INTEGER = ("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")  # fmt: skip
+INTEGER = (
+    *("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16"),
+    *("Int32", "UInt32", "Int64", "UInt64"),
+)
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\d+)*)\]\Z")
 
 

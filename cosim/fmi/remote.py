@@ -15,7 +15,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from typing import Any, BinaryIO
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,10 @@ class Worker:
         self._process = subprocess.Popen(
             [sys.executable, "-m", module], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._requests: Any = self._process.stdin
+        self._answers: Any = self._process.stdout
 
     def call(self, name: str, *arguments: Any, limit: float) -> Any:
         """Call a function there and return what it returns, within `limit` seconds.
@@ -59,10 +64,9 @@ class Worker:
             What the function raised.
         """
         process = self._process
-        assert process.stdin is not None and process.stdout is not None
         try:
-            _send(process.stdin, (name, arguments))
-            answer = _receive(process.stdout, time.monotonic() + limit)
+            _send(self._requests, (name, arguments))
+            answer = _receive(self._answers, time.monotonic() + limit)
         except TimeoutError:
             self.close(kill=True)
             raise ProcessError(f"{self._what} did not answer within {limit:g} s") from None
@@ -80,20 +84,17 @@ class Worker:
         process = self._process
         if kill:
             process.kill()
-        assert process.stdin is not None and process.stdout is not None
-        try:
-            process.stdin.close()
-        except OSError:
-            pass
+        with suppress(OSError):
+            self._requests.close()
         try:
             process.wait(timeout=10)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-        process.stdout.close()
+        self._answers.close()
 
 
-def _send(stream: BinaryIO, value: Any) -> None:
+def _send(stream: Any, value: Any) -> None:
     data = pickle.dumps(value, protocol=5)
     stream.write(_HEADER.pack(len(data)) + data)
     stream.flush()
@@ -184,10 +185,8 @@ class RemoteFleet:
 
     def close(self) -> None:
         """Free every instance and end the process."""
-        try:
+        with suppress(TerrafixError):  # it is ended all the same
             self._worker.call("close", limit=self._limit)
-        except TerrafixError:
-            pass  # it is ended all the same
         self._worker.close()
 
 

@@ -37,9 +37,10 @@ from terrafix.cosim.ssp.names import (
 )
 from terrafix.cosim.system import Connection, System
 from terrafix.cosim.units import base_units
-from terrafix.cosim.wiring import field_factor
+from terrafix.cosim.wiring import port_factor
 
-for _prefix, _uri in (("ssd", SSD), ("ssc", SSC), ("ssv", SSV), ("osp", OSP), ("oms", OMS), ("terrafix", OWN)):  # fmt: skip
+_PREFIXES = {"ssd": SSD, "ssc": SSC, "ssv": SSV, "osp": OSP, "oms": OMS, "terrafix": OWN}
+for _prefix, _uri in _PREFIXES.items():  # some tools read the prefix instead of the namespace
     ET.register_namespace(_prefix, _uri)
 
 
@@ -144,7 +145,9 @@ def _refuse(system: System, plan: Plan, paths: Sequence[str], leave_out: Sequenc
         for c in plan.flat.connections
         if plan.flat.port(c.target).kind == "message" and _factors(plan, c) is not None
     ]
-    problems += [f"dispersion '{d.name}': a package has no ensembles" for d in plan.flat.dispersions]
+    problems += [
+        f"dispersion '{d.name}': a package has no ensembles" for d in plan.flat.dispersions
+    ]
     if problems:
         raise ConfigurationError(
             "\n  ".join([f"system '{system.name}' cannot be written as SSP", *problems])
@@ -152,12 +155,8 @@ def _refuse(system: System, plan: Plan, paths: Sequence[str], leave_out: Sequenc
 
 
 def _factors(plan: Plan, connection: Connection) -> Any:
-    source, target = plan.flat.port(connection.source), plan.flat.port(connection.target)
-    for name, field in source.fields.items():
-        factor = field_factor(field, target.fields[name])
-        if factor is not None and np.any(factor != 1.0):
-            return factor
-    return None
+    """Factors by scalar where units are converted, else None."""
+    return port_factor(plan.flat.port(connection.source), plan.flat.port(connection.target))
 
 
 def _fmu(system: System, plan: Plan, path: str, folder: Path, platforms: str) -> Path:
@@ -165,9 +164,7 @@ def _fmu(system: System, plan: Plan, path: str, folder: Path, platforms: str) ->
     if isinstance(component, Fmu):
         return component.interface.archive.path
     file = folder / f"{_file_name(path)}.fmu"
-    export_fmu(
-        system, file, component=path, fmi=2, platforms=platforms, name=_file_name(path)
-    )
+    export_fmu(system, file, component=path, fmi=2, platforms=platforms, name=_file_name(path))
     return file
 
 
@@ -245,7 +242,7 @@ class _Writer:
             attributes = {"name": shown, "component": _file_name(owner), "port": port}
             ET.SubElement(element, tag(OWN, "Expose"), attributes)
         ET.indent(root)
-        return ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+        return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
 
     @staticmethod
     def _annotation(parent: ET.Element, kind: str) -> ET.Element:
@@ -314,7 +311,7 @@ class _Writer:
                 if isinstance(quantity.unit, str)
                 else [quantity.unit[i[-1]] for i in np.ndindex(quantity.shape)]
             )
-            for name, unit in zip(_elements(quantity.name, quantity.shape), units, strict=True):
+            for name, unit in zip(quantity.scalars(), units, strict=True):
                 yield name, kind, unit, quantity.kind not in ("Real",)
         if port.t is not None and port.sequence is not None:
             yield port.t.name, kind, "s", False
@@ -322,16 +319,12 @@ class _Writer:
 
     def _scalar_connections(self) -> Iterator[ET.Element]:
         for connection in self.connections:
-            source, target = self.plan.flat.owner(connection.source), self.plan.flat.owner(connection.target)  # fmt: skip
+            owners = [self.plan.flat.owner(p) for p in (connection.source, connection.target)]
+            source, target = owners
             pairs = zip(
                 self._scalars(connection.source), self._scalars(connection.target), strict=True
             )
-            factors = _factors(self.plan, connection)
-            flat = None
-            if factors is not None:
-                width = self._port(connection.target).fields
-                size = sum(q.size for q, _ in width.values())
-                flat = np.broadcast_to(factors, (size,)) if np.ndim(factors) == 0 else np.resize(factors, size)  # fmt: skip
+            flat = _factors(self.plan, connection)
             for k, ((start, *_), (end, *_)) in enumerate(pairs):
                 element = ET.Element(
                     tag(SSD, "Connection"),
@@ -366,9 +359,7 @@ class _Writer:
             found.pop(name, None)
         if not found:
             return None
-        root = ET.Element(
-            tag(SSV, "ParameterSet"), {"version": "1.0", "name": _file_name(path)}
-        )
+        root = ET.Element(tag(SSV, "ParameterSet"), {"version": "1.0", "name": _file_name(path)})
         parameters = ET.SubElement(root, tag(SSV, "Parameters"))
         component = self.plan.flat.components[path]
         given = component.given_starts() if isinstance(component, Fmu) else {}
@@ -376,7 +367,7 @@ class _Writer:
         for quantity in found.values():
             values = given.get(quantity.name, quantity.start or [0.0] * quantity.size)
             unit = quantity.unit if isinstance(quantity.unit, str) else "1"
-            for name, value in zip(_elements(quantity.name, quantity.shape), np.ravel(values), strict=True):  # fmt: skip
+            for name, value in zip(quantity.scalars(), np.ravel(values), strict=True):
                 made = ET.SubElement(parameters, tag(SSV, "Parameter"), name=name)
                 if quantity.kind == "Real":
                     typed = ET.SubElement(made, tag(SSV, "Real"), value=number(float(value)))
@@ -400,12 +391,6 @@ def _write_units(parent: ET.Element, names: set[str]) -> None:
             if known[0] != 1.0:
                 attributes["factor"] = number(known[0])
         ET.SubElement(unit, tag(SSC, "BaseUnit"), attributes)
-
-
-def _elements(name: str, shape: tuple[int, ...]) -> list[str]:
-    if not shape:
-        return [name]
-    return [f"{name}[{','.join(str(i + 1) for i in index)}]" for index in np.ndindex(shape)]
 
 
 def _rate(rate: Rate) -> dict[str, str]:

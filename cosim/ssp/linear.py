@@ -28,8 +28,11 @@ class Linear(Component):
         y = Output(shape, unit=self._base["unit_out"], doc="factor * x + offset")
         x.name, y.name = "x", "y"
         self.ports = {"x": x, "y": y}
-        numbers = [np.array([float(v) for v in self._base[k].split(",")]) for k in ("factor", "shift")]  # fmt: skip
-        self._factor, self._offset = (n[0] if self._base["flat"] else n for n in numbers)
+        self._factor, self._offset = self._numbers("factor"), self._numbers("shift")
+
+    def _numbers(self, name: str) -> Any:
+        values = np.array([float(v) for v in self._base[name].split(",")])
+        return values[0] if self._base["flat"] else values
 
     def _initialize_impl(self) -> None:
         self._step_impl(0.0, 0.0)

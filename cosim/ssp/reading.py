@@ -19,7 +19,6 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 from terrafix.cosim.clock import Rate, seconds
-from terrafix.cosim.component import Component
 from terrafix.cosim.errors import ConfigurationError, TerrafixError, nearest
 from terrafix.cosim.fmi.archive import checked_xml, unpack
 from terrafix.cosim.fmi.component import Fmu
@@ -157,7 +156,11 @@ class _Reader:
             )
         for shown, name, port in wanted:
             path = f"{name}.{port}"
-            if port is not None and shown not in system.exposed and path not in system.exposed.values():
+            if (
+                port is not None
+                and shown not in system.exposed
+                and path not in system.exposed.values()
+            ):
                 system.expose(shown, fmus[name][port])
 
     # ------------------------------------------------------------------ the document
@@ -225,13 +228,18 @@ class _Reader:
                 names[name] = f"system {full}"
                 self._gather(element, f"{full}_", into, joints)
             else:
-                raise ConfigurationError(f"'{self.file}' has a {kind} '{name}', which terrafix does not read")
+                raise ConfigurationError(
+                    f"'{self.file}' has a {kind} '{name}', which terrafix does not read"
+                )
         here = "" if not prefix else f"system {prefix[:-1]}"
         self._bind_parameters(system, prefix, into)
         for connection in _children(system, "Connections", "Connection"):
             ends: list[End] = []
             for side in ("start", "end"):
-                owner, connector = connection.get(f"{side}Element"), connection.get(f"{side}Connector")
+                owner, connector = (
+                    connection.get(f"{side}Element"),
+                    connection.get(f"{side}Connector"),
+                )
                 if owner is not None and owner not in names:
                     raise ConfigurationError(
                         f"'{self.file}' connects '{owner}.{connector}', but there is no '{owner}'\n"
@@ -420,26 +428,19 @@ def _port_of(fmu: Fmu, connector: str) -> str | None:
     return None if found is None else found[0]
 
 
-def _grouped(
-    links: Sequence[_Link], fmus: Mapping[str, Component]
-) -> dict[tuple[End, End], bool]:
-    """Ports that are joined, and whether every element of one meets the same element of the other."""
+def _grouped(links: Sequence[_Link], fmus: Mapping[str, Fmu]) -> dict[tuple[End, End], bool]:
+    """Ports that are joined; whether every element of one meets the same of the other."""
     places: dict[tuple[End, End], list[tuple[int, int]]] = defaultdict(list)
-    transformed: set[tuple[End, End]] = set()
     for link in links:
         a, b = fmus[link.source[0]], fmus[link.target[0]]
-        assert isinstance(a, Fmu) and isinstance(b, Fmu)
         source, target = a.scalar_names().get(link.source[1]), b.scalar_names().get(link.target[1])
         if source is None or target is None:
             continue  # said when they are connected
         key = ((link.source[0], source[0]), (link.target[0], target[0]))
         places[key].append((source[1], target[1]))
-        if (link.factor, link.offset) != (1.0, 0.0):
-            transformed.add(key)
     whole = {}
     for key, pairs in places.items():
         a, b = fmus[key[0][0]], fmus[key[1][0]]
-        assert isinstance(a, Fmu) and isinstance(b, Fmu)
         sizes = [sum(p == port for p, _ in f.scalar_names().values())
                  for f, port in ((a, key[0][1]), (b, key[1][1]))]  # fmt: skip
         same = sorted(pairs) == [(k, k) for k in range(len(pairs))]
@@ -459,8 +460,8 @@ def _starts(fmu: Fmu, values: Mapping[str, Any]) -> dict[str, Any]:
         if any(g is None for g in given):
             missing = names[[g is None for g in given].index(True)]
             raise ConfigurationError(f"its parameter set has no value for '{missing}'")
-        numbers = [{"true": 1.0, "false": 0.0}.get(g[0]) if g[0] in ("true", "false") else float(g[0])
-                   for g in given if g is not None]  # fmt: skip
+        words = {"true": 1.0, "false": 0.0}
+        numbers = [words.get(g[0]) or float(words.get(g[0], g[0])) for g in given if g is not None]
         unit = given[0][1] if given[0] is not None else None
         value: Any = numbers[0] if not quantity.shape else _nested(numbers, quantity.shape)
         usable = unit and isinstance(quantity.unit, str) and quantity.unit not in ("", "1")

@@ -60,7 +60,7 @@ def found(spring, tmp_path, fmi=3, **changes):
         ),
         (
             "cycles",
-            [("fmi3.c", "{ free(instance); }", "{ memset(malloc(8192), 1, 8192), free(instance); }")],
+            [("fmi3.c", "{ free(instance); }", "{ char *volatile p = malloc(8192); memset(p, 1, 8192); free(instance); }")],
             "leaves",
         ),
         (
@@ -109,9 +109,14 @@ def test_a_wrong_description_is_found(spring, tmp_path):
 
 @pytest.mark.parametrize(
     ("statement", "said"),
-    [("*(volatile int *)0 = 1;", "signal 11"), ("for (volatile int k = 0;; k++) ;", "did not answer")],
+    [
+        ("*(volatile int *)0 = 1;", "signal 11"),
+        ("for (volatile int k = 0;; k++) ;", "did not answer"),
+    ],
 )
-def test_a_crash_or_hang_is_a_finding_and_the_checks_go_on(spring, tmp_path, statement, said, monkeypatch):
+def test_a_crash_or_hang_is_a_finding_and_the_checks_go_on(
+    spring, tmp_path, statement, said, monkeypatch
+):
     monkeypatch.setattr(checking, "LIMIT", 3.0)
     patches = [("core.c", "    double tick = TICKS_TO_SECONDS(1), count", f"    {statement}\n    double tick = TICKS_TO_SECONDS(1), count")]  # fmt: skip
     file = broken(spring(3), tmp_path / "broken.fmu", patches=patches)

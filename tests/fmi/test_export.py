@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import fmu_parts
 import numpy as np
@@ -174,7 +175,9 @@ def test_the_two_meanings_of_an_input_read_at_the_end(spring, fmi):
     state, expected = {"x": 0.3, "v": 0.0}, []
     for k in range(50):
         force = (k + 1) * h
-        outputs, state = model.advance(**state, force=force, stiffness=4.0, mass=1.5, x0=0.3, step=h)
+        outputs, state = model.advance(
+            **state, force=force, stiffness=4.0, mass=1.5, x0=0.3, step=h
+        )
         expected.append(float(outputs["acceleration"][0]))
     assert sampled(fmi, spring, ahead=1) == pytest.approx(np.array(expected), rel=1e-13, abs=1e-14)
     late = sampled(fmi, spring, ahead=0)
@@ -191,7 +194,9 @@ def test_any_multiple_of_the_tick_is_a_step(spring, fmi):
     coarse.step(0.0, 0.07)
     coarse.step(0.07, 0.0)
     coarse.step(0.07, 0.23)
-    assert np.array_equal(subject.get(fine, subject.outputs()), subject.get(coarse, subject.outputs()))
+    assert np.array_equal(
+        subject.get(fine, subject.outputs()), subject.get(coarse, subject.outputs())
+    )
     for wrong in (0.015, 0.004):
         with pytest.raises(FmuError, match=r"must be a multiple of 0.01") as raised:
             coarse.step(0.3, wrong)
@@ -273,7 +278,12 @@ def test_derivatives_of_model_exchange(exported, fmi):
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize(
     ("name", "known", "size"),
-    [("attitude", "r_e", 1e4), ("attitude", "v_e", 10.0), ("predict", "delta_v_b", 1e-2), ("ads", "q_be_true", 1e-2)],
+    [
+        ("attitude", "r_e", 1e4),
+        ("attitude", "v_e", 10.0),
+        ("predict", "delta_v_b", 1e-2),
+        ("ads", "q_be_true", 1e-2),
+    ],
 )
 def test_derivatives_of_co_simulation(exported, name, known, size, fmi):
     """Of outputs by inputs at the communication point, against steps with other inputs."""
@@ -353,8 +363,7 @@ def test_five_thousand_instances_one_after_another(spring, fmi):
     subject = Subject(open_archive(spring(fmi)), CO_SIMULATION)
 
     def resident():
-        with open("/proc/self/statm") as file:
-            return int(file.read().split()[1]) * 4096
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
     for k in range(5000):
         instance = subject.started()
@@ -432,8 +441,14 @@ def test_the_noise_key_is_that_of_python(tmp_path):
     ("arguments", "message"),
     [
         ({"component": "orbitt"}, r"has no component 'orbitt'\n  did you mean 'orbit'\?"),
-        ({"component": "evaluation"}, r"'evaluation' is a NavigationEvaluation, which is written in"),
-        ({}, r"cannot be exported as one FMU: 'evaluation' \(NavigationEvaluation\) is not symbolic"),
+        (
+            {"component": "evaluation"},
+            r"'evaluation' is a NavigationEvaluation, which is written in",
+        ),
+        (
+            {},
+            r"cannot be exported as one FMU: 'evaluation' \(NavigationEvaluation\) is not symbolic",
+        ),
         ({"component": "orbit", "fmi": 1}, r"there is no FMI 1\n  write 2 or 3"),
         ({"component": "orbit", "platforms": "linx"}, r"there is no platform 'linx'"),
     ],
@@ -459,7 +474,9 @@ def test_targets_that_cannot_be_written(tmp_path, target, message):
 def test_a_component_alone_needs_start_values_to_start(tmp_path):
     from terrafix.components.attitude import LvlhAttitude
 
-    with pytest.raises(ConfigurationError, match=r"not finite at its start .*\(r_e, v_e, delta_v_e\)"):
+    with pytest.raises(
+        ConfigurationError, match=r"not finite at its start .*\(r_e, v_e, delta_v_e\)"
+    ):
         export_fmu(LvlhAttitude(), tmp_path / "x.fmu")
     start = {"r_e": {"": [7e6, 0, 0]}, "v_e": {"": [0, 7.5e3, 0]}}
     made = export_fmu(LvlhAttitude(), tmp_path / "x.fmu", start=start)

@@ -212,7 +212,7 @@ def test_an_fmu_that_returns_an_error(spring, tmp_path, fmi):
 
 def test_one_member_that_fails_is_excluded(spring, tmp_path):
     line = _AT_ONE[1]
-    body = f'    if (strchr(i->name, \'1\') && t > 0.045) return fail(i, "no");\n{line}'
+    body = f"    if (strchr(i->name, '1') && t > 0.045) return fail(i, \"no\");\n{line}"
     file = broken(spring(2), tmp_path / "one.fmu", patches=[("core.c", line, body)])
     result = simulate(alone(Fmu(file=file, rate=Rate("0.01"))), members=3, duration="0.1")
     assert [(e["member"], e["t_s"]) for e in result.excluded] == [(1, 0.06)]
@@ -291,7 +291,9 @@ def test_a_binary_of_another_platform(spring, tmp_path):
         for name in archive.namelist():
             data = archive.read(name)
             out.writestr(name.replace("linux64", "win64").replace(".so", ".dll"), data)
-    with pytest.raises(ConfigurationError, match=r"no binary for this machine, linux64; it has win64"):
+    with pytest.raises(
+        ConfigurationError, match=r"no binary for this machine, linux64; it has win64"
+    ):
         alone(Fmu(file=target))
 
 

@@ -168,7 +168,9 @@ def test_a_navigation_system_comes_back_to_the_same_bytes(navigation, tmp_path):
 
 
 def test_ecos_flies_it_too(navigation):
-    found = in_another_process("ecospy", ECOS, navigation, 100, "orbit::r_e[1]", "predict::prior.r_e[1]")
+    found = in_another_process(
+        "ecospy", ECOS, navigation, 100, "orbit::r_e[1]", "predict::prior.r_e[1]"
+    )
     native = final(System.from_file(OPEN_LOOP), "1", ["orbit.r_e"])
     assert found[0] == native[0][0, 0]
     assert np.isfinite(found[1])
@@ -216,9 +218,7 @@ def package(path, components, connections, files, extra=""):
 
 
 def component(name, source, bindings=""):
-    return (
-        f'<ssd:Component name="{name}" source="resources/{source}">{bindings}</ssd:Component>'
-    )
+    return f'<ssd:Component name="{name}" source="resources/{source}">{bindings}</ssd:Component>'
 
 
 @pytest.fixture(scope="module")

@@ -154,9 +154,7 @@ PLATFORMS = ("x86_64-linux", "aarch64-linux", "x86_64-windows", "x86_64-darwin",
 def test_binaries_for_other_platforms(tmp_path, platforms):
     """Linked, with the functions of FMI and nothing else, for old C libraries."""
     file = tmp_path / "orbit.fmu"
-    export_fmu(
-        System.from_file(OPEN_LOOP), file, component="orbit", platforms=",".join(platforms)
-    )
+    export_fmu(System.from_file(OPEN_LOOP), file, component="orbit", platforms=",".join(platforms))
     folder = open_archive(file).folder / "binaries"
     assert sorted(p.name for p in folder.iterdir()) == sorted(platforms)
     for platform in platforms:
