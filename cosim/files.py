@@ -58,7 +58,7 @@ from terrafix.cosim.errors import (
     nearest,
 )
 from terrafix.cosim.loading import Load
-from terrafix.cosim.parameters import PATHS, Count, FilePath, shown
+from terrafix.cosim.parameters import PATHS, Count, FilePath, FileTable, shown
 from terrafix.cosim.registry import component_entries, component_type
 from terrafix.cosim.system import System
 
@@ -275,7 +275,11 @@ def _set(load: Load, component: Component, key: str, value: Any, *, from_file: b
     if len(load.problems) > before:
         component._base[key] = None
         return False
-    if isinstance(settings[key], PATHS) and from_file:
+    setting = settings[key]
+    if isinstance(setting, FileTable) and from_file:
+        placed = setting.beside(component.setting(key), load.folder)
+        component._settings[key] = component._base[key] = placed
+    if isinstance(setting, PATHS) and from_file:
         file = component.setting(key)
         component._settings[key] = component._base[key] = load.folder / file
     return True

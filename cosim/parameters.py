@@ -319,6 +319,23 @@ class Table(Setting[dict[str, Any]]):
         return dict(value)
 
 
+class FileTable(Table):
+    """Files by name: ``files = { a = "a.fmu" }``, relative to the system file."""
+
+    def read(self, value: Any, *, where: str, bare: bool = True) -> dict[str, Any]:
+        """Accept a table of paths, as `FilePath` accepts them."""
+        table = super().read(value, where=where, bare=bare)
+        return {k: FilePath().read(v, where=f"{where}.{k}") for k, v in table.items()}
+
+    def beside(self, value: dict[str, Path], folder: Path) -> dict[str, Path]:
+        """Take relative paths to begin at a folder."""
+        return {name: folder / path for name, path in value.items()}
+
+    def write(self, value: dict[str, Path]) -> dict[str, str]:
+        """Write the paths as text."""
+        return {name: str(path.absolute()) for name, path in value.items()}
+
+
 _VARIABLE = re.compile(r"\$\{(\w+)(?::-([^}]*))?\}|\$(\w+)")
 
 

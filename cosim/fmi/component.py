@@ -218,8 +218,8 @@ class Fmu(Component):
         written = [(p.name, n, q) for p in self._outputs for n, (q, _) in p.fields.items()]
         written += [(p.name, "t", p.t) for p in self._outputs if p.t]
         written += [(p.name, "sequence", p.sequence) for p in self._outputs if p.sequence]
-        inputs, self._input_at = _groups(read)
-        outputs, self._output_at = _groups(written)
+        inputs, self._input_at = grouped(read)
+        outputs, self._output_at = grouped(written)
         setup = Setup(
             str(Path(self._base["file"]).absolute()),
             interface.kind,
@@ -410,7 +410,7 @@ class Fmu(Component):
         self._t, self._first = float(saved["t"]), bool(saved["first"])
 
 
-def _groups(
+def grouped(
     quantities: Sequence[tuple[str, str, Quantity]],
 ) -> tuple[tuple[Group, ...], dict[tuple[str, str], slice]]:
     """Gather quantities by type, side by side in a row; where each one stands."""

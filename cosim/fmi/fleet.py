@@ -190,6 +190,7 @@ class Fleet:
     def __init__(self, setup: Setup, n_members: int) -> None:
         self._quick: dict[int, _Quick] = {}
         self._live: list[int] = []
+        self._marks: dict[int, ct.c_void_p] = {}
         self.setup = setup
         self.archive = open_archive(setup.file)
         self.library = load_library(self.archive, setup.kind)
@@ -383,8 +384,27 @@ class Fleet:
                 if row in self._integrators:
                     self._integrators[row].restart()
 
+    def mark(self) -> None:
+        """Keep the present state of every instance that is stepped, to return to."""
+        for row in self._live:
+            instance = self.instances[row]
+            assert instance is not None
+            self._marks[row] = instance.get_state(self._marks.get(row))
+
+    def return_to_mark(self) -> None:
+        """Set every instance back to where it was marked."""
+        for row in self._live:
+            instance = self.instances[row]
+            assert instance is not None
+            instance.set_state(self._marks[row])
+
     def close(self) -> None:
         """Terminate and free every instance."""
+        for row, state in self._marks.items():
+            instance = self.instances[row]
+            if instance is not None:
+                instance.free_state(state)
+        self._marks = {}
         for row, instance in enumerate(self.instances):
             if instance is None:
                 continue

@@ -17,6 +17,7 @@ from terrafix.cosim.fmi import fleet
 from terrafix.cosim.fmi.binding import MODEL_EXCHANGE
 from terrafix.cosim.fmi.component import Fmu
 from terrafix.cosim.fmi.export import export_fmu
+from terrafix.cosim.fmi.loop import FmuLoop
 from terrafix.cosim.run import RunError, simulate
 from terrafix.cosim.simulation import Simulation
 from terrafix.cosim.system import System
@@ -142,6 +143,40 @@ def test_a_ring_of_integrators(tmp_path):
             for source, target in ("ab", "bc", "ca"):
                 ring.connect(f"{source}.y", f"{target}.u")
         assert outputs(ring, "1", "a.y") == pytest.approx(1.01**power, rel=1e-12)
+
+
+def test_a_ring_iterated_to_convergence(tmp_path):
+    """Inputs of a step are the outputs at its end: the implicit Euler method, 1 / 0.99^100."""
+    export_fmu(fmu_parts.EulerIntegrator(), tmp_path / "integrator.fmu", fmi=3)
+    files = dict.fromkeys("abc", tmp_path / "integrator.fmu")
+    loop = FmuLoop(files=files, connect="a.y -> b.u, b.y -> c.u, c.y -> a.u", rate=Rate("0.01"))
+    (y,) = outputs(alone(loop), "1", "part.a_y")
+    assert y == pytest.approx(0.99**-100, rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("connect", "message"),
+    [
+        ("a.y > b.u", "is no connection: write a.y -> b.u"),
+        ("a.y -> d.u", r"has no FMU 'd'"),
+        ("a.z -> b.u", r"FMU 'a' has no port 'z'"),
+        ("a.u -> b.u", r"a.u is an input; a connection goes from an output"),
+    ],
+)
+def test_loops_that_cannot_be_made(tmp_path, connect, message):
+    export_fmu(fmu_parts.EulerIntegrator(), tmp_path / "i.fmu", fmi=2)
+    files = dict.fromkeys("ab", tmp_path / "i.fmu")
+    with pytest.raises(WiringError, match=message):
+        alone(FmuLoop(files=files, connect=connect, rate=Rate("0.01")))
+
+
+def test_a_loop_that_does_not_settle_excludes_its_members(tmp_path):
+    export_fmu(fmu_parts.EulerIntegrator(), tmp_path / "i.fmu", fmi=2)
+    loop = FmuLoop(
+        files={"a": tmp_path / "i.fmu"}, connect="a.y -> a.u", rate=Rate("0.01"), most_iterations=2
+    )
+    with pytest.raises(StepError, match="signals did not settle in 2 repetitions of a step"):
+        simulate(alone(loop), duration="0.1")
 
 
 # ------------------------------------------------------------------ ensembles and state
