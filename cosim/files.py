@@ -259,7 +259,10 @@ def _component(
             refused += 1
     made.rate = load.attempt(_rate, timing, f"'{name}'") or made.rate
     if not refused and not made.missing_settings():
+        before = len(load.problems)
         load.attempt(made.prepare)
+        if len(load.problems) > before:
+            load.broken.add(name)
     elif type(made).prepare is not Component.prepare:
         load.broken.add(name)  # its ports depend on its parameters
 

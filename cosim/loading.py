@@ -124,6 +124,8 @@ class Load:
         """Whether a problem of the whole system merely follows from what was noted."""
         if not system.nodes and self.problems:
             return True
+        if any(str(problem).startswith(f"'{name}' has no rate") for name in self.broken):
+            return True  # its file may have brought one
         match = _UNCONNECTED.match(str(problem))
         return match is not None and (
             self.unread or any(_meant(system, a, b, match[1]) for a, b in self.refused)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.cosim.buffers import BundleView
-from terrafix.cosim.clock import Rate
+from terrafix.cosim.clock import Rate, seconds
 from terrafix.cosim.component import Component
 from terrafix.cosim.errors import ConfigurationError, nearest
 from terrafix.cosim.fmi.archive import open_archive
@@ -195,9 +195,13 @@ class Fmu(Component):
 
     def validate(self) -> None:
         """Refuse an FMU whose step does not fit its rate."""
+        if self._interface is None:
+            return  # its file was refused, and that was said
         interface = self.interface
         step = getattr(interface.archive.description.coSimulation, "fixedInternalStepSize", None)
         tick = float(step or 0.0)
+        if interface.own:
+            tick = float(seconds(interface.archive.annotation.get("tick", "0"), "tick"))
         if interface.kind != CO_SIMULATION or not tick or self.rate is None:
             return
         for time in self.rate.exact_numbers or self.rate.times or ():

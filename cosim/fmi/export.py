@@ -28,6 +28,7 @@ from terrafix.cosim.component import Component
 from terrafix.cosim.errors import ConfigurationError, TerrafixError, nearest
 from terrafix.cosim.fmi.binaries import PLATFORMS, build, chosen_platforms, host_platform
 from terrafix.cosim.fmi.code import compiled, headers, sources
+from terrafix.cosim.fmi.component import Fmu
 from terrafix.cosim.fmi.description import build_description, model_description
 from terrafix.cosim.fmi.layout import Layout, Source
 from terrafix.cosim.fmi.page import icon, page
@@ -346,6 +347,8 @@ def _whole(system: System, plan: Plan) -> Source:
 
 
 def _symbolic(path: str, component: Component) -> None:
+    if isinstance(component, Fmu):
+        raise ConfigurationError(f"'{path}' is an FMU already: its file can be handed on as it is")
     if not component.capabilities.symbolic:
         raise ConfigurationError(
             f"'{path}' is a {type(component).__name__}, which is written in Python: only symbolic "

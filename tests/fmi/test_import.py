@@ -205,6 +205,50 @@ def test_a_run_with_fmus_resumes_to_the_same_bytes(exported, tmp_path, isolate):
         simulation.master.terminate()
 
 
+@pytest.mark.parametrize("isolate", [False, True])
+def test_a_member_alone_is_that_of_any_ensemble(exported, isolate):
+    """Noise of its own from the run's seed and the member's number."""
+
+    def drawn(members):
+        system = System.from_file(OPEN_LOOP)
+        for name in ("imu", "antenna"):
+            fmu = Fmu(file=exported(name, 3), rate=system.nodes[name].rate, isolate=isolate)
+            system.replace(name, fmu)
+        simulation = Simulation(system, members=members, seed=77)
+        simulation.run_until("0.2")
+        slots = simulation.master.wiring.slots
+        found = np.hstack([slots[p].data for p in ("imu.delta_v_b", "antenna.q_mu")])
+        simulation.master.terminate()
+        return found
+
+    whole = drawn(7)
+    assert len({row.tobytes() for row in whole}) == 7
+    assert np.array_equal(drawn([5]), whole[5:6])
+    assert np.array_equal(drawn(7), whole)
+
+
+def test_system_files_with_fmus_that_cannot_be_used(spring, tmp_path):
+    text = (
+        'schema = "terrafix-system/1"\nname = "s"\n[component.a]\ntype = "fmu"\n{}\n'
+        '[record.r]\nports = ["a.x"]\n'
+    )
+    (tmp_path / "spring.fmu").write_bytes(spring(2).read_bytes())
+    for lines, message in (
+        ('file = "none.fmu"', "cannot read '.*none.fmu'"),
+        ('file = "s.toml"', "is no FMU: file is not a zip file"),
+        ('file = "spring.fmu"\nstart = { mass = "1 m" }', "'a.start.mass' is given in m"),
+        ('file = "spring.fmu"\nstart = 3', "it takes a table: write { name ="),
+        ('file = "spring.fmu"\nrate = "70 Hz"', "its FMU takes multiples of 0.01 s"),
+    ):
+        (tmp_path / "s.toml").write_text(text.format(lines))
+        with pytest.raises(SystemCheckError, match=message) as raised:
+            System.from_file(tmp_path / "s.toml")
+        assert len(raised.value.problems) == 1
+    (tmp_path / "s.toml").write_text(text.format('file = "spring.fmu"\nstart = { mass = "1 kg" }'))
+    System.from_file(tmp_path / "s.toml").to_file(tmp_path / "again.toml")
+    assert System.from_file(tmp_path / "again.toml").nodes["a"].setting("start") == {"mass": "1 kg"}
+
+
 def test_an_fmu_without_state_says_so(ramp, tmp_path):
     with pytest.raises(Exception, match=r"'part' \(Fmu\) cannot save its state"):
         simulate(alone(Fmu(file=ramp, rate=Rate("0.1"))), duration="1", checkpoint_every="0.5",
