@@ -15,7 +15,7 @@ from terrafix.cosim.kernel_compiled import without_null_checks
 
 LANES = 4  # as in core.c
 SMALL = 2000  # instructions of a function that shares a file with others
-FIXED = ("core.h", "core.c")
+FIXED = ("core.h", "core.c", "portable.h")
 _CAUSALITIES = ("independent", "input", "output", "parameter", "local")
 
 
@@ -115,7 +115,8 @@ def function_source(name: str, functions: Sequence[Any]) -> str:
     generator = ca.CodeGenerator(name, {"with_header": False})
     for function in functions:
         generator.add(function)
-    return "#define CASADI_SYMBOL_EXPORT\n" + without_null_checks(generator.dump())
+    head = '#include "portable.h"\n#define CASADI_SYMBOL_EXPORT\n'
+    return head + without_null_checks(generator.dump())
 
 
 def model_source(layout: Layout, token: str) -> str:
