@@ -287,6 +287,9 @@ def _notes(flat: FlatSystem) -> Iterator[str]:
                     f"record '{record.name}' ({rate}) samples '{path}', which is published "
                     f"{source}: between its steps the last value is held"
                 )
+    for path, component in flat.components.items():
+        for note in component.capabilities.notes:
+            yield f"'{path}': {note}"
     for connection in flat.connections:
         target = flat.port(connection.target)
         if target.at == "start":

@@ -102,7 +102,11 @@ class Fmu(Component):
                     )
         if self.rate is None and (period := self._default_period()) is not None:
             self.rate = Rate(period)
-        notes = () if found.serialize else ("its state cannot be saved",)
+        notes: tuple[str, ...] = ()
+        if not found.serialize:
+            notes = ("its state cannot be saved: no checkpoints",)
+        if found.left_out:
+            notes += (f"{', '.join(found.left_out)} cannot be connected: no numbers",)
         self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
 
     def _default_period(self) -> Fraction | None:

@@ -588,9 +588,13 @@ enum status set_real(struct instance *i, const struct variable *v, int32_t eleme
         if (is_nan(x) || (infinite && !(v->flags & INFINITE)))
             return fail(i, "'%s' is set to %g", element_name(v, element + k), x);
         if (x < v->minimum || x > v->maximum || (v->flags & POSITIVE && x <= 0))
-            return fail(i, "'%s' is set to %.17g; it must be %s %g%s", element_name(v, element + k),
-                        x, x > v->maximum ? "at most" : v->flags & POSITIVE ? "above" : "at least",
-                        x > v->maximum ? v->maximum : v->flags & POSITIVE ? 0 : v->minimum, "");
+            return fail(i, "'%s' is set to %.17g; it must be %s %g", element_name(v, element + k), x,
+                        x > v->maximum        ? "at most"
+                        : v->flags & POSITIVE ? "above"
+                                              : "at least",
+                        x > v->maximum        ? v->maximum
+                        : v->flags & POSITIVE ? 0
+                                              : v->minimum);
     }
     memcpy(i->now.real + (v->flags & STATE ? v->state : v->offset) + element, value,
            size * sizeof(double));

@@ -186,7 +186,6 @@ void serialize(const struct data *, char *);
 enum status deserialize(struct instance *, const char *, size_t, struct data *);
 
 #define ALLOWED(mode) (1u << (mode))
-#define ANY_MODE (~0u)
 #define RUNNING (ALLOWED(STEPPING) | ALLOWED(EVENT) | ALLOWED(CONTINUOUS))
 
 #endif

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from fmu_helpers import OPEN_LOOP, broken
 
+from terrafix.cosim.check import check
 from terrafix.cosim.checkpoint import read_checkpoint, write_checkpoint
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.errors import ConfigurationError, StepError, SystemCheckError, WiringError
@@ -45,7 +46,8 @@ def ramp(tmp_path_factory):
     (folder / "ramp.py").write_text(
         textwrap.dedent(
             """
-            from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real
+            from pythonfmu import (
+                Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real, String)
 
             class Ramp(Fmi2Slave):
                 def __init__(self, **kwargs):
@@ -54,6 +56,8 @@ def ramp(tmp_path_factory):
                     self.register_variable(Real("u", causality=Fmi2Causality.input))
                     self.register_variable(Real("y", causality=Fmi2Causality.output))
                     self.register_variable(Integer("n", causality=Fmi2Causality.output))
+                    self.word = "hello"
+                    self.register_variable(String("word", causality=Fmi2Causality.output))
                     self.register_variable(Real("k", causality=Fmi2Causality.parameter,
                                                 variability=Fmi2Variability.tunable))
                 def do_step(self, t, h):
@@ -111,6 +115,10 @@ def test_a_foreign_fmu_reads_at_the_start_and_its_period_is_found(ramp):
     fmu = Fmu(file=ramp, rate=Rate("0.1"), start={"k": 2.0, "u": 3.0})
     system = alone(fmu)
     assert fmu.ports["u"].at == "start"
+    assert check(system).notes == [
+        "'part': its state cannot be saved: no checkpoints",
+        "'part': word cannot be connected: no numbers",
+    ]
     assert fmu.ports["n"].single.dtype == np.int64
     assert outputs(system, "1", "part.y") == pytest.approx(1 + 10 * 0.1 * 2 * 3)
 
