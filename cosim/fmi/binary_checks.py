@@ -17,7 +17,10 @@ _SYSTEM = re.compile(
     r"|user32|advapi32|msvcrt|ucrtbase|vcruntime|ntdll|bcrypt)",
     re.IGNORECASE,
 )
-_OURS_OF_ELF = {"_init", "_fini", "__bss_start", "_edata", "_end"}
+_OF_LINKERS = {  # in every shared library, of whatever content
+    *("_init", "_fini", "__bss_start", "_edata", "_end"),
+    *("_mh_dylib_header", "__dso_handle"),
+}
 
 
 def parse(path: Path) -> Any:
@@ -37,8 +40,8 @@ def exported(binary: Any) -> set[str]:
         return {str(e.name) for e in found.entries} if found is not None else set()
     names = {str(s.name) for s in binary.exported_symbols}
     if isinstance(binary, lief.MachO.Binary):
-        return {n.removeprefix("_") for n in names}
-    return names - _OURS_OF_ELF
+        names = {n.removeprefix("_") for n in names}
+    return names - _OF_LINKERS
 
 
 def required(binary: Any) -> set[str]:
