@@ -627,7 +627,5 @@ def main() -> None:
     serve({"check": run_check})
 
 
-__all__ = ["CHECKS", "Finding", "Subject", "run_check"]
-
 if __name__ == "__main__":
     main()

@@ -26,7 +26,7 @@ from terrafix.cosim.check import Plan, check
 from terrafix.cosim.clock import text_seconds
 from terrafix.cosim.component import Component
 from terrafix.cosim.errors import ConfigurationError, TerrafixError, nearest
-from terrafix.cosim.fmi.binaries import PLATFORMS, build, chosen_platforms, host_platform
+from terrafix.cosim.fmi.binaries import build, chosen_platforms
 from terrafix.cosim.fmi.code import compiled, headers, sources
 from terrafix.cosim.fmi.component import Fmu
 from terrafix.cosim.fmi.description import build_description, model_description
@@ -392,11 +392,3 @@ def start_values(system: System, plan: Plan, path: str) -> dict[str, dict[str, A
         }  # fmt: skip
     finally:
         master.terminate()
-
-
-def platform_names() -> tuple[str, ...]:
-    """Names that `export_fmu` takes as platforms."""
-    return ("host", "all", *PLATFORMS)
-
-
-__all__ = ["Exported", "checked_target", "export_fmu", "host_platform", "platform_names"]

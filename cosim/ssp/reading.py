@@ -473,6 +473,3 @@ def _nested(numbers: list[Any], shape: tuple[int, ...]) -> Any:
     import numpy as np
 
     return np.reshape(numbers, shape).tolist()
-
-
-__all__ = ["read_ssp"]
