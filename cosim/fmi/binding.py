@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes as ct
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -112,12 +113,10 @@ def _callbacks2(environment: int) -> Any:
     given.allocateMemory = fmi2.defaultCallbacks.allocateMemory
     given.freeMemory = fmi2.defaultCallbacks.freeMemory
     given.componentEnvironment = environment
-    try:
+    with suppress(ImportError, OSError):  # without its library the message stands unformatted
         from fmpy.logging import addLoggerProxy
 
         addLoggerProxy(ct.byref(given))
-    except Exception:  # the message then stands unformatted
-        pass
     return given
 
 
@@ -250,17 +249,15 @@ class Instance:
 
     # ------------------------------------------------------------------ life cycle
 
-    def begin(self, t: float, stop: float | None = None) -> None:
+    def begin(self, t: float) -> None:
         """Enter initialization mode at a time [s]."""
-        time, end = ct.c_double(t), ct.c_double(stop or 0.0)
+        none, time = ct.c_double(0.0), ct.c_double(t)
         if self._version == 2:
-            self.call("SetupExperiment", 0, ct.c_double(0.0), time, int(stop is not None), end)
+            self.call("SetupExperiment", 0, none, time, 0, none)
             self.call("EnterInitializationMode")
         else:
-            defined = ct.c_bool(stop is not None)
-            self.call(
-                "EnterInitializationMode", ct.c_bool(False), ct.c_double(0.0), time, defined, end
-            )
+            no = ct.c_bool(False)
+            self.call("EnterInitializationMode", no, none, time, no, none)
 
     def finish(self) -> None:
         """Leave initialization mode."""

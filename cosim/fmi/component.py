@@ -222,6 +222,7 @@ class Fmu(Component):
         self._inputs = [p for p in interface.ports if p.is_input and p.kind == "signal"]
         self._messages = [p for p in interface.ports if p.is_input and p.kind == "message"]
         self._outputs = [p for p in interface.ports if not p.is_input]
+        self._published = [p for p in self._outputs if p.kind == "message"]
         read = [(p.name, n, q) for p in self._inputs for n, (q, _) in p.fields.items()]
         written = [(p.name, n, q) for p in self._outputs for n, (q, _) in p.fields.items()]
         written += [(p.name, "t", p.t) for p in self._outputs if p.t]
@@ -254,7 +255,9 @@ class Fmu(Component):
         self._take_inputs(finite=True)
         self._bind_copies()
         self._report(self._fleet.start(env.active.copy(), self._fresh_messages()))
-        self._publish()
+        for target, source in self._results:
+            target[...] = source
+        self._publish_messages()
 
     def _start_settings(self) -> tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]:
         parameters = self.interface.parameters
@@ -342,8 +345,7 @@ class Fmu(Component):
             self._report(failures)
         for target, source in self._results:
             target[...] = source
-        if len(self._results) < len(self._output_at):
-            self._publish()
+        self._publish_messages()
 
     def _report(self, failures: Failures) -> None:
         for row, text in failures.items():
@@ -370,15 +372,11 @@ class Fmu(Component):
                 sent.append(Message(quantity.kind, tuple(quantity.references), rows, chosen))
         return sent
 
-    def _publish(self) -> None:
-        """Publish outputs: signals always, messages where their number has changed."""
+    def _publish_messages(self) -> None:
+        """Publish messages where their number has changed."""
         fleet = self._fleet
         assert fleet is not None
-        for target, source in self._results:
-            target[...] = source
-        for port in self._outputs:
-            if port.kind != "message":
-                continue
+        for port in self._published:
             number = fleet.outputs[:, self._output_at[port.name, "sequence"]][:, 0].astype(np.int64)
             new = number > self._sequence[port.name]
             if not new.any():

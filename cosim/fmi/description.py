@@ -9,7 +9,8 @@ from importlib.metadata import version as installed
 from xml.etree import ElementTree as ET
 
 from terrafix.cosim.clock import text_seconds
-from terrafix.cosim.fmi.layout import Layout, Unknown
+from terrafix.cosim.fmi.dependencies import Dependencies, Unknown
+from terrafix.cosim.fmi.layout import Layout
 from terrafix.cosim.fmi.variables import Variable
 from terrafix.cosim.units import base_units
 
@@ -68,6 +69,7 @@ class _Writer:
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
+        self.dependencies = Dependencies(layout)
         self.variables = [*layout.reals, *layout.integers]
 
     def units(self, parent: ET.Element) -> None:
@@ -236,9 +238,9 @@ class _Fmi3(_Writer):
             variables.append(self.variable(variable))
         structure = ET.SubElement(root, "ModelStructure")
         for tag, unknowns in (
-            ("Output", self.layout.outputs),
-            ("ContinuousStateDerivative", self.layout.derivatives),
-            ("InitialUnknown", self.layout.initial_unknowns),
+            ("Output", self.dependencies.outputs),
+            ("ContinuousStateDerivative", self.dependencies.derivatives),
+            ("InitialUnknown", self.dependencies.initial_unknowns),
         ):
             for unknown in unknowns:
                 known = unknown.variables()
@@ -340,9 +342,9 @@ class _Fmi2(_Writer):
                 variables.append(element)
         structure = ET.SubElement(root, "ModelStructure")
         for tag, unknowns in (
-            ("Outputs", self.layout.outputs),
-            ("Derivatives", self.layout.derivatives),
-            ("InitialUnknowns", self.layout.initial_unknowns),
+            ("Outputs", self.dependencies.outputs),
+            ("Derivatives", self.dependencies.derivatives),
+            ("InitialUnknowns", self.dependencies.initial_unknowns),
         ):
             if unknowns:
                 self.unknowns(ET.SubElement(structure, tag), unknowns)

@@ -12,10 +12,10 @@ symbolic becomes one FMU with its schedule inside and its exposed ports outside.
 from __future__ import annotations
 
 import os
+import re
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -118,28 +118,20 @@ def export_fmu(
     chosen = chosen_platforms(platforms)
     source = source_of(what, component, start)
     if name is not None:
+        if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
+            raise ConfigurationError(
+                f"'{name}' cannot name a model: use letters, digits and underscores, a letter first"
+            )
         source.name = name
     layout = laid_out(source, fmi)
-    identifier = source.name
-    token = instantiation_token(layout, fmi)
-    texts = sources(layout, fmi, token)
+    texts, token = sources(layout, fmi)
     files = compiled(texts)
-    binaries = build(texts | headers(fmi), files, chosen)
-    content: dict[str, bytes] = {
-        "modelDescription.xml": model_description(layout, fmi, token, identifier, files),
-        "documentation/index.html": page(layout).encode(),
-        "sources/buildDescription.xml": build_description(identifier, files),
-    }
-    picture = icon(layout)
-    if fmi == 2:
-        content["model.png"] = picture
-    else:
-        content["terminalsAndIcons/icon.png"] = picture
-        content["terminalsAndIcons/terminalsAndIcons.xml"] = _ICONS.encode()
-    for file, text in (texts | headers(fmi)).items():
-        content[f"sources/{file}"] = text.encode()
+    texts |= headers(fmi)
+    binaries = build(texts, files, chosen)
+    content = _documents(layout, fmi, token, files)
+    content |= {f"sources/{file}": text.encode() for file, text in texts.items()}
     for each, library in binaries.items():
-        content[f"binaries/{each.folder(fmi)}/{identifier}{each.suffix}"] = library
+        content[f"binaries/{each.folder(fmi)}/{source.name}{each.suffix}"] = library
     write_archive(target, content)
     variables = [*layout.reals, *layout.integers]
     return Exported(
@@ -153,6 +145,22 @@ def export_fmu(
         sum(v.causality == "parameter" for v in variables),
         text_seconds(source.base),
     )
+
+
+def _documents(layout: Layout, fmi: int, token: str, files: list[str]) -> dict[str, bytes]:
+    """All but sources and binaries: descriptions, page and icon."""
+    identifier = layout.source.name
+    content = {
+        "modelDescription.xml": model_description(layout, fmi, token, identifier, files),
+        "documentation/index.html": page(layout).encode(),
+        "sources/buildDescription.xml": build_description(identifier, files),
+    }
+    if fmi == 2:
+        return content | {"model.png": icon(layout)}
+    return content | {
+        "terminalsAndIcons/icon.png": icon(layout),
+        "terminalsAndIcons/terminalsAndIcons.xml": _ICONS.encode(),
+    }
 
 
 _ICONS = """<?xml version="1.0" encoding="UTF-8"?>
@@ -206,14 +214,6 @@ def write_archive(target: Path, content: Mapping[str, bytes]) -> None:
     except OSError as error:
         draft.unlink(missing_ok=True)
         raise ConfigurationError(f"cannot write '{target}': {error.strerror}") from error
-
-
-def instantiation_token(layout: Layout, version: int) -> str:
-    """Hash of all that description and binary must agree on."""
-    texts = sources(layout, version, "")
-    text = "\0".join([str(version), *(f"{k}\0{v}" for k, v in sorted(texts.items()))])
-    digest = sha256(text.encode()).hexdigest()
-    return f"{{{digest[:8]}-{digest[8:12]}-{digest[12:16]}-{digest[16:20]}-{digest[20:32]}}}"
 
 
 def laid_out(source: Source, version: int) -> Layout:

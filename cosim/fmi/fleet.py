@@ -206,9 +206,7 @@ class Fleet:
 
     # ------------------------------------------------------------------ life cycle
 
-    def start(
-        self, active: NDArray[np.bool_], messages: Sequence[Message] = (), stop: float | None = None
-    ) -> Failures:
+    def start(self, active: NDArray[np.bool_], messages: Sequence[Message] = ()) -> Failures:
         """Instantiate and initialize the active members with what stands in `inputs`.
 
         Afterwards `outputs` hold the values at t = 0.
@@ -216,7 +214,7 @@ class Fleet:
         failures: Failures = {}
         for row in np.flatnonzero(active).tolist():
             try:
-                self._start_one(row, messages, stop)
+                self._start_one(row, messages)
             except FmuError as error:
                 self._failed[row] = _STEP
                 failures[row] = str(error)
@@ -225,13 +223,13 @@ class Fleet:
         self._prepare_calls()
         return failures
 
-    def _start_one(self, row: int, messages: Sequence[Message], stop: float | None) -> None:
+    def _start_one(self, row: int, messages: Sequence[Message]) -> None:
         instance = self.instances[row] = Instance(self.library, f"{self.setup.name}_{row}")
         for kind, vr, values in self.setup.starts:
             instance.set(kind, references(vr), values)
         for kind, vr, values in self.setup.each:
             instance.set(kind, references(vr), values[row])
-        instance.begin(0.0, stop)
+        instance.begin(0.0)
         self._set_all(instance, row)
         for message in messages:
             message.send(row, instance)

@@ -130,29 +130,6 @@ class Continuous:
 
 
 @dataclass
-class Unknown:
-    """An output, derivative or start value, and what it depends on, element by element."""
-
-    variable: Variable
-    knowns: list[Variable]
-    pattern: BoolArray  # (elements of the variable, elements of all knowns together)
-
-    def of_element(self, element: int) -> list[tuple[Variable, int]]:
-        """What one element depends on: (variable, element)."""
-        columns = [(v, k) for v in self.knowns for k in range(v.size)]
-        return [columns[c] for c in np.flatnonzero(self.pattern[element])]
-
-    def variables(self) -> list[Variable]:
-        """Variables that any element depends on."""
-        starts = np.cumsum([0] + [v.size for v in self.knowns])
-        return [
-            v
-            for v, a, b in zip(self.knowns, starts, starts[1:], strict=False)
-            if self.pattern[:, a:b].any()
-        ]
-
-
-@dataclass
 class Source:
     """What is exported: components by path, in the order of stepping, and how they are joined.
 
@@ -236,7 +213,6 @@ class Layout:
     n_integers : int
     seed, member : int
         Places of these two.
-    outputs, derivatives, initial_unknowns : list of Unknown
     """
 
     def __init__(self, source: Source) -> None:
@@ -261,7 +237,6 @@ class Layout:
         self._inner_outputs()
         self.parts = [self._part(path) for path in source.components]
         self.continuous = self._continuous()
-        self.outputs, self.derivatives, self.initial_unknowns = self._dependencies()
         self._nominals()
 
     # ------------------------------------------------------------------ allocation
@@ -688,100 +663,6 @@ class Layout:
             size = float(np.max(np.abs(at[variable.state]), initial=0.0))
             variable.nominal = size if np.isfinite(size) and size > 0 else 1.0
 
-    # ------------------------------------------------------------------ dependencies
-
-    def _dependencies(self) -> tuple[list[Unknown], list[Unknown], list[Unknown]]:
-        """What each unknown depends on, by the sparsity of the functions, exactly."""
-        outputs = [v for v in [*self.reals, *self.integers] if v.causality == "output"]
-        inputs = [v for v in [*self.reals, *self.integers] if v.causality == "input"]
-        exact = inputs + [v for v in [*self.reals, *self.integers] if v.causality == "parameter"]
-        started = self._spread(exact, lambda part: part.initial)
-        states = self.continuous.states if self.continuous else []
-        rates = self.continuous.derivatives if self.continuous else []
-        if self.continuous is None:
-            known = [v for v in inputs if not v.at_start]
-            stepped = self._spread(known, lambda part: part.step)
-        else:
-            known = states + inputs
-            stepped = self._seeded(known)
-            for variable in states:
-                self._seed(stepped, variable, known, at=variable.state)
-            self._through(stepped, self.continuous.rate, self.continuous.targets)
-            self._through(started, self.continuous.rate, self.continuous.targets)
-        return (
-            [self._unknown(v, stepped, known) for v in outputs],
-            [self._unknown(v, stepped, known) for v in rates],
-            [self._unknown(v, started, exact) for v in dict.fromkeys([*outputs, *states, *rates])],
-        )
-
-    def _row(self, variable: Variable) -> int:
-        """Row of a variable's first element: integers follow all reals."""
-        return variable.offset + (len(self.start_real) if variable.kind == "integer" else 0)
-
-    def _seeded(self, known: Sequence[Variable]) -> BoolArray:
-        width = sum(v.size for v in known)
-        reach = np.zeros((len(self.start_real) + len(self.start_integer), width), dtype=np.bool_)
-        for variable in known:
-            self._seed(reach, variable, known, at=self._row(variable))
-        return reach
-
-    @staticmethod
-    def _seed(reach: BoolArray, variable: Variable, known: Sequence[Variable], at: Any) -> None:
-        column = 0
-        for other in known:
-            if other is variable:
-                break
-            column += other.size
-        for k in range(variable.size):
-            reach[at + k, column + k] = True
-
-    def _spread(self, known: Sequence[Variable], choose: Any) -> BoolArray:
-        """Reach of `known` through all parts in their order."""
-        reach = self._seeded(known)
-        n_real = len(self.start_real)
-        noise = [n_real + p for p in (self.seed, self.member) if p >= 0]
-        for part in self.parts:
-            for copy in part.convert:
-                if not copy.integer:
-                    source = reach[copy.source : copy.source + copy.size]
-                    reach[copy.target : copy.target + copy.size] = source
-            for message in part.received:
-                if message.fresh >= 0:
-                    reach[message.fresh] = reach[n_real + message.sequence]
-            for stream in part.streams:
-                reach[stream.offset : stream.offset + stream.size] = reach[noise].any(axis=0)
-            self._through(reach, choose(part), part.targets, part)
-        return reach
-
-    def _through(
-        self, reach: BoolArray, call: Call, targets: Sequence[Target], part: Part | None = None
-    ) -> None:
-        """Reach of the results of a function, from that of its arguments."""
-        pattern = _sparsity(call.function)
-        function = call.function
-        arguments = np.concatenate(
-            [np.arange(a, a + function.numel_in(i)) for i, a in enumerate(call.arguments)]
-        )
-        results = (pattern @ reach[arguments].astype(np.int64)) > 0
-        at = 0
-        sent: dict[int, BoolArray] = {}
-        if part is not None:
-            for number, message in enumerate(part.published):
-                if message.valid >= 0:
-                    sent[number] = results[message.valid]
-                    row = len(self.start_real) + message.sequence
-                    reach[row] = results[message.valid]
-        for target in targets:
-            rows = results[at : at + target.size]
-            at += target.size
-            if target.message in sent:
-                rows = rows | sent[target.message]
-            reach[target.offset : target.offset + target.size] = rows
-
-    def _unknown(self, variable: Variable, reach: BoolArray, known: Sequence[Variable]) -> Unknown:
-        row = self._row(variable) if variable.state is None else variable.state
-        return Unknown(variable, list(known), reach[row : row + variable.size].copy())
-
 
 def _size(model: Any, name: str) -> int:
     return int(np.prod(model.shape(name), dtype=np.int64))
@@ -819,19 +700,3 @@ def _forward(call: Call, name: str, by: Sequence[int], n_outputs: int) -> Call:
         tangents = [ca.SX.zeros(r.numel()) for r in results]
     made = ca.Function(name, [*symbols, *seeds], tangents, {"cse": True})
     return Call(made, list(call.arguments), [call.arguments[i] for i in by])
-
-
-def _sparsity(function: Any) -> NDArray[np.int64]:
-    """Which results depend on which arguments, all in a row: (results, arguments)."""
-    import casadi as ca
-
-    symbols = [ca.SX.sym(f"x{i}", function.numel_in(i)) for i in range(function.n_in())]
-    results = function(*symbols)
-    results = list(results) if isinstance(results, tuple | list) else [results]
-    n_results, n_arguments = sum(r.numel() for r in results), sum(s.numel() for s in symbols)
-    pattern = np.zeros((n_results, n_arguments), dtype=np.int64)
-    if n_results and n_arguments:
-        found = ca.jacobian_sparsity(ca.vertcat(*results), ca.vertcat(*symbols))
-        rows, columns = found.get_triplet()
-        pattern[list(rows), list(columns)] = 1
-    return pattern

@@ -45,6 +45,10 @@ class FmuLoop(Component):
         self._links = [
             self._link(text) for text in self._base["connect"].split(",") if text.strip()
         ]
+        self._factors = [
+            port_factor(self._parts[a].ports[y], self._parts[b].ports[u])
+            for a, y, b, u in self._links
+        ]
         driven = {(b, port) for _, _, b, port in self._links}
         self.ports = {}
         for name, part in self._parts.items():
@@ -140,9 +144,8 @@ class FmuLoop(Component):
     def _inside(self) -> FloatArray:
         """Hand outputs on to inputs within; by how much these change, for each member."""
         change = np.zeros(self.n_members)
-        for a, y, b, u in self._links:
+        for (a, y, b, u), factor in zip(self._links, self._factors, strict=True):
             values = self._fleets[a].outputs[:, self._at[a, y]]
-            factor = port_factor(self._parts[a].ports[y], self._parts[b].ports[u])
             values = values if factor is None else values * factor
             target = self._fleets[b].inputs[:, self._at[b, u]]
             change = np.maximum(

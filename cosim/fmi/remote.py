@@ -153,11 +153,9 @@ class RemoteFleet:
         self._worker = Worker("terrafix.cosim.fmi.remote", f"the FMU '{setup.file}'")
         self._worker.call("make", setup, n_members, limit=FIRST_LIMIT)
 
-    def start(
-        self, active: NDArray[np.bool_], messages: Sequence[Message] = (), stop: float | None = None
-    ) -> Failures:
+    def start(self, active: NDArray[np.bool_], messages: Sequence[Message] = ()) -> Failures:
         """As `Fleet.start`."""
-        return self._exchange("start", active, messages, stop)
+        return self._exchange("start", active, messages)
 
     def step(
         self,
