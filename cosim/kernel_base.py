@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 from terrafix.cosim.noise import check_members
 
 FloatArray = NDArray[np.float64]
-_KINDS = ("array", "noise", "shared")
+_SHARED = ("shared", "step", "time")
+_KINDS = ("array", "constant", "noise", *_SHARED)
 
 
 class Argument(NamedTuple):
     """One argument of the function, in order.
 
-    `kind` is ``"array"`` (one row of `size` numbers per member), ``"shared"`` (one row for all)
-    or ``"noise"`` (standard normals drawn by the kernel, for which no array is bound).
+    `kind` is ``"array"`` (one row of `size` numbers per member), ``"constant"`` (as an array, but
+    its numbers do not change between calls), ``"shared"`` (one row for all), ``"step"`` and
+    ``"time"`` (one number for all: the length of the step, the time at its end), or ``"noise"``
+    (standard normals drawn by the kernel, for which no array is bound).
     """
 
     name: str
@@ -72,7 +75,7 @@ class Kernel(ABC):
     Attributes
     ----------
     kind : str
-        ``"c"`` or ``"vm"``.
+        ``"vector"``, ``"c"`` or ``"vm"``.
     note : str
         One line for the user if the kernel is not of the kind that was hoped for, else empty.
     """
@@ -155,7 +158,7 @@ class Kernel(ABC):
         """
         bound = BoundArrays(
             {
-                a.name: self._rows(arrays, a.name, a.size, 1 if a.kind == "shared" else n_members)
+                a.name: self._rows(arrays, a.name, a.size, 1 if a.kind in _SHARED else n_members)
                 for a in self.arguments
                 if a.kind != "noise"
             },

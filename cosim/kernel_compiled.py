@@ -17,7 +17,7 @@ _DRAWN_AT_ONCE = 2048  # pairs of normals: 32 kB of scratch
 _LANES = 4  # ciphers side by side: with more, one member alone pays for numbers it does not use
 
 
-_EXPORT = """\
+EXPORT = """\
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
 #else
@@ -29,7 +29,7 @@ _EXPORT = """\
 @cache
 def _driver() -> str:
     here = Path(__file__)
-    return _EXPORT + "\n".join(here.with_name(f).read_text() for f in ("noise.c", "kernel.c"))
+    return EXPORT + "\n".join(here.with_name(f).read_text() for f in ("noise.c", "kernel.c"))
 
 
 def _pairs(argument: Argument) -> int:
@@ -65,7 +65,7 @@ def kernel_source(kernel: Kernel) -> str:
     code = generator.dump()
     if kernel.function.is_a("SXFunction"):
         code = without_null_checks(code)
-    lines = ["#define CASADI_SYMBOL_EXPORT static", code]
+    lines = ["#define CASADI_SYMBOLEXPORT static", code]
     lines += [f"#define {name} {value}".rstrip() for name, value in definitions.items()]
     return "\n".join([*lines, _driver()])
 

@@ -44,7 +44,7 @@ class _VirtualMachineBinding(BoundKernel):
         for member in range(n_members):
             buffer, evaluate = kernel.function.buffer()
             for i, argument in enumerate(kernel.arguments):
-                row = 0 if argument.kind == "shared" else member
+                row = 0 if len(rows[argument.name]) == 1 else member
                 buffer.set_arg(i, rows[argument.name][row].data)
             for i, columns in enumerate(self._columns):
                 buffer.set_res(i, self._next[member, columns].data)

@@ -5,10 +5,11 @@ the arrays it works on. Calling what was bound draws the noise of that step, eva
 function for every active member and writes the results of those whose results are all finite; a
 member that fails keeps its old values, is marked, and is not stepped again while the mark stands.
 
-There are two kinds with the same meaning: ``"c"``, the function's C compiled together with the
-driver ``kernel.c``, and ``"vm"``, CasADi's virtual machine, where no compiler works. They agree
-to the last bit on arithmetic and square roots, noise included, and to the accuracy of the
-mathematical library on the rest. Callers need not know which they hold.
+There are three kinds with the same meaning: ``"vector"``, C of vectors whose lanes are members;
+``"c"``, the C that CasADi generates, a member at a time, for functions that are not made of scalar
+instructions; ``"vm"``, CasADi's virtual machine, where no compiler works. They agree to the last
+bit on arithmetic and square roots, noise included, and to the accuracy of the mathematical library
+on the rest (in practice they call the same one). Callers need not know which they hold.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ import ctypes
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import Any
+from typing import Any, NamedTuple
 
 from terrafix.cosim import toolchain
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.kernel_base import Argument, BoundKernel, Kernel, Result, Specification
 from terrafix.cosim.kernel_compiled import CompiledKernel, kernel_source
+from terrafix.cosim.kernel_vector import NoVectors, VectorKernel, vector_source
 from terrafix.cosim.kernel_virtual import VirtualMachineKernel
 
 __all__ = [
@@ -58,35 +60,95 @@ def build_kernels(
     Raises
     ------
     ConfigurationError
-        If ``TERRAFIX_KERNEL`` is wrong, or is ``c`` and compilation fails.
+        If ``TERRAFIX_KERNEL`` is wrong, or asks for what cannot be compiled.
     ValueError
         If a declaration does not fit its function.
     """
     virtual: list[Kernel] = [VirtualMachineKernel(s) for s in specifications]
     if toolchain.find_compiler() is None:
         return virtual
-    sources = [kernel_source(kernel) for kernel in virtual]
-    distinct = list(dict.fromkeys(sources))
+    candidates = [_candidates(kernel) for kernel in virtual]
     loaded: dict[str, ctypes.CDLL | toolchain.CompilationError] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        futures = {pool.submit(toolchain.load, source): source for source in distinct}
-        for future in as_completed(futures):
-            try:
-                loaded[futures[future]] = future.result()
-            except toolchain.CompilationError as error:
-                if toolchain.compilation_required():
-                    raise ConfigurationError(
-                        f"TERRAFIX_KERNEL=c asks for compiled kernels, which cannot be had: {error}"
-                    ) from error
-                loaded[futures[future]] = error
-            if progress:
-                progress(len(loaded), len(distinct))
-    kernels: list[Kernel] = []
-    for specification, kernel, source in zip(specifications, virtual, sources, strict=True):
-        library = loaded[source]
-        if isinstance(library, toolchain.CompilationError):
-            kernel.note = f"'{kernel.name}' ({library})"
-            kernels.append(kernel)
-        else:
-            kernels.append(CompiledKernel(specification, library))
-    return kernels
+        todo = {c.source: c for found in candidates for c in found[:1]}
+        while todo:
+            futures = {
+                pool.submit(toolchain.load, source, native=c.native): source
+                for source, c in todo.items()
+            }
+            for future in as_completed(futures):
+                try:
+                    loaded[futures[future]] = future.result()
+                except toolchain.CompilationError as error:
+                    loaded[futures[future]] = error
+                if progress:
+                    progress(len(loaded), len({c.source for found in candidates for c in found}))
+            todo = {c.source: c for found in candidates if (c := _next(found, loaded))}
+    return [_made(*each, loaded) for each in zip(specifications, virtual, candidates, strict=True)]
+
+
+class _Candidate(NamedTuple):
+    """One way to make a kernel: its source, and whether it is for this processor alone."""
+
+    source: str
+    native: bool
+    make: Callable[[Specification, ctypes.CDLL], Kernel]
+
+
+def _candidates(kernel: Kernel) -> list[_Candidate]:
+    """Ways to make a kernel, the best first."""
+    wanted = toolchain.wanted_kernel()
+    found = []
+    refusal = ""
+    if wanted != "c":
+        try:
+            source, n_invariants = vector_source(kernel)
+
+            def make(specification: Specification, library: ctypes.CDLL) -> Kernel:
+                return VectorKernel(specification, library, n_invariants)
+
+            found.append(_Candidate(source, True, make))
+        except NoVectors as error:
+            refusal = str(error)
+    if wanted != "vector":
+        found.append(_Candidate(kernel_source(kernel), False, CompiledKernel))
+    elif refusal:
+        raise ConfigurationError(
+            f"TERRAFIX_KERNEL=vector asks for vector kernels, and '{kernel.name}' cannot be one: "
+            f"{refusal}"
+        )
+    return found
+
+
+def _next(
+    candidates: list[_Candidate], loaded: dict[str, ctypes.CDLL | toolchain.CompilationError]
+) -> _Candidate | None:
+    """The next candidate to try: none once one is loaded, or all have failed."""
+    for candidate in candidates:
+        if candidate.source not in loaded:
+            return candidate
+        if not isinstance(loaded[candidate.source], toolchain.CompilationError):
+            return None
+    return None
+
+
+def _made(
+    specification: Specification,
+    virtual: Kernel,
+    candidates: list[_Candidate],
+    loaded: dict[str, ctypes.CDLL | toolchain.CompilationError],
+) -> Kernel:
+    """The best kernel that could be made; the virtual machine if none could."""
+    for candidate in candidates:
+        library = loaded[candidate.source]
+        if not isinstance(library, toolchain.CompilationError):
+            return candidate.make(specification, library)
+    error = loaded[candidates[-1].source]
+    assert isinstance(error, toolchain.CompilationError)
+    if toolchain.compilation_required():
+        raise ConfigurationError(
+            f"TERRAFIX_KERNEL={toolchain.wanted_kernel()} asks for compiled kernels, which cannot "
+            f"be had: {error}"
+        ) from error
+    virtual.note = f"'{virtual.name}' ({error})"
+    return virtual

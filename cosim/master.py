@@ -2,7 +2,8 @@
 
 It knows ticks, components and links, and nothing of what flows through them. Which components are
 due comes from a heap of next ticks; the work of a tick is a list made once for each combination
-of components that are due together.
+of components that are due together. Where these are symbolic components with nothing between them,
+their ticks up to the next other event are handed to one call of compiled code (`stretch`).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,18 @@ from terrafix.cosim.check import Plan
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component
 from terrafix.cosim.errors import ConfigurationError, StepError, TerrafixError
-from terrafix.cosim.links import DelayLine, Transfer
+from terrafix.cosim.links import CopyMessage, DelayLine, Transfer
+from terrafix.cosim.messages import MessageReader
+from terrafix.cosim.stretch import Stretch
+from terrafix.cosim.symbolic import NOT_FINITE, SymbolicComponent
 
 Mask = NDArray[np.bool_]
+
+
+def _reader(transfer: Transfer) -> MessageReader | None:
+    """The reader that a transfer refreshes, if that is all it does."""
+    owner = getattr(transfer, "__self__", None)
+    return owner if isinstance(owner, MessageReader) and owner.depth == 1 else None
 
 
 class _Group:
@@ -33,6 +43,8 @@ class _Group:
         self._base, self._grid = plan.base, plan.grid
         self._numerator, self._denominator = plan.base.numerator, plan.base.denominator
         self.sample: Callable[[float], None] | None = None
+        # ticks from one activation to the next; 0 where they are listed
+        self.spacing = 0 if rate.period is None else int(rate.period / plan.base)
         self.move_to(0)
 
     def move_to(self, tick: int) -> None:
@@ -63,6 +75,15 @@ class _Entry:
         self.before: tuple[Transfer, ...] = tuple(wiring.before.get(path, ()))
         self.after = tuple(wiring.after.get(path, ()))
         self.clear = tuple(wiring.clear.get(path, ()))
+
+
+class _Program(NamedTuple):
+    """The work of a tick at which certain groups are due."""
+
+    entries: tuple[_Entry, ...]
+    latches: tuple[Transfer, ...]
+    samples: tuple[Callable[[float], None], ...]
+    stretch: Stretch | None
 
 
 class Master:
@@ -119,7 +140,7 @@ class Master:
             )
             for path in plan.order
         }
-        self._programs: dict[tuple[int, ...], tuple[Any, ...]] = {}
+        self._programs: dict[tuple[int, ...], _Program] = {}
         self._heap: list[tuple[int, int]] = []
 
     def _group(self, rate: Rate) -> _Group:
@@ -190,14 +211,91 @@ class Master:
         ]
         heapq.heapify(self._heap)
 
-    def _program(self, due: tuple[int, ...]) -> tuple[Any, ...]:
+    def _program(self, due: tuple[int, ...]) -> _Program:
         groups = set(due)
-        entries = [e for p, e in self._entries.items() if self._group_of[p] in groups]
-        latches = [t for e in entries for t in self.wiring.latch.get(e.path, ())]
-        samples = [s for i in due if (s := self._groups[i].sample) is not None]
-        program = (tuple(entries), tuple(latches), tuple(samples))
+        entries = tuple(e for p, e in self._entries.items() if self._group_of[p] in groups)
+        latches = tuple(t for e in entries for t in self.wiring.latch.get(e.path, ()))
+        samples = tuple(s for i in due if (s := self._groups[i].sample) is not None)
+        stretch = None
+        if len(due) == 1 and not samples and self._groups[due[0]].spacing:
+            stretch = self._stretch(entries, latches)
+        program = _Program(entries, latches, samples, stretch)
         self._programs[due] = program
         return program
+
+    def _stretch(
+        self, entries: tuple[_Entry, ...], latches: tuple[Transfer, ...]
+    ) -> Stretch | None:
+        """The ticks of these components as one call, if nothing else happens at them.
+
+        None of them publishes messages, so that readers stand still once they have seen what
+        came before, and copies of messages have nothing to copy.
+        """
+        stages = []
+        for entry in entries:
+            component = entry.component
+            if not isinstance(component, SymbolicComponent) or entry.after or entry.clear:
+                return None
+            stage = component.kernel_stage
+            if stage is None:
+                return None
+            stages.append(stage)
+            for transfer in entry.before:
+                if not isinstance(transfer, CopyMessage) and _reader(transfer) is None:
+                    return None
+        if not stages or not all(isinstance(transfer, CopyMessage) for transfer in latches):
+            return None
+        try:
+            return Stretch(stages)
+        except ValueError:  # arrays that overlap
+            return None
+
+    def _fly(self, program: _Program, group: _Group, number: int, end: int) -> bool:
+        """Step a group's ticks from its next one on, before `end` and anybody else's, at once.
+
+        Nothing is done, and False returned, if that is only one tick, or not like the others.
+        """
+        assert program.stretch is not None and group.next_tick is not None
+        first, spacing = group.next_tick, group.spacing
+        last = min([end, *(later[0] - 1 for later in self._heap[1:3])])
+        n_ticks = (last - first) // spacing + 1
+        if n_ticks < 2 or first - group.tick != spacing or last * self._numerator > 2**53:
+            return False
+        for entry in program.entries:
+            for transfer in entry.before:
+                reader = _reader(transfer)
+                if reader is not None and reader.waiting:
+                    return False
+                transfer(first)
+        components = [entry.component for entry in program.entries]
+        dt = spacing * self._numerator / self._denominator
+        failures = program.stretch.fly(
+            [component.step_index + 1 for component in components],
+            tick=first,
+            spacing=spacing,
+            n_ticks=n_ticks,
+            seconds_per_tick=(self._numerator, self._denominator),
+            dt=dt,
+        )
+        last = first + (n_ticks - 1) * spacing
+        for component in components:
+            assert isinstance(component, SymbolicComponent)
+            component.stretched(n_ticks, self.seconds(last), dt)
+        self.component_steps += n_ticks * len(components)
+        for failure in failures:
+            self.tick = first + failure.tick * spacing
+            components[failure.stage].fail(failure.members, NOT_FINITE)
+            self._check_members()
+        self.tick = last
+        group.move_to(last)
+        self._rearm(group, number)
+        return True
+
+    def _rearm(self, group: _Group, number: int) -> None:
+        if group.next_tick is None:
+            heapq.heappop(self._heap)
+        else:
+            heapq.heapreplace(self._heap, (group.next_tick, number))
 
     def run_until(self, end: int) -> None:
         """Step to tick `end`.
@@ -229,17 +327,18 @@ class Master:
                     number = heap[0][1]
                     due: tuple[int, ...] = (number,)
                     group = groups[number]
+                    program = programs.get(due) or self._program(due)
+                    if program.stretch is not None and self._fly(program, group, number, end):
+                        n_excluded = len(self.excluded)
+                        continue
                     group.advance()
-                    if group.next_tick is None:
-                        heapq.heappop(heap)
-                    else:
-                        heapq.heapreplace(heap, (group.next_tick, number))
+                    self._rearm(group, number)
                 else:
                     due = self._pop(tick)
-                program = programs.get(due) or self._program(due)
+                    program = programs.get(due) or self._program(due)
                 t = tick * numerator / denominator
                 self.tick = tick
-                for entry in program[0]:
+                for entry in program.entries:
                     for transfer in entry.before:
                         transfer(tick)
                     entry.step(t, entry.group.dt)
@@ -247,11 +346,11 @@ class Master:
                         collect(tick, t)
                     for clear in entry.clear:
                         clear()
-                self.component_steps += len(program[0])
+                self.component_steps += len(program.entries)
                 entry = None
-                for transfer in program[1]:
+                for transfer in program.latches:
                     transfer(tick)
-                for sample in program[2]:
+                for sample in program.samples:
                     sample(t)
                 if len(self.excluded) != n_excluded:
                     n_excluded = len(self.excluded)

@@ -208,6 +208,11 @@ class MessageReader:
             return view
         raise AttributeError(f"there is no field '{name}'; the fields are {sorted(fields)}")
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a message came that `refresh` has not seen."""
+        return self.slot.version != self._version
+
     def collect(self, slot: MessageSlot) -> None:
         """Keep a copy of what was just published to `slot` (queues deeper than one)."""
         if slot.version == self._collected:

@@ -21,13 +21,16 @@ from numpy.typing import NDArray
 from terrafix.cosim.buffers import BundleView
 from terrafix.cosim.component import Component, Environment
 from terrafix.cosim.errors import ConfigurationError, nearest
+from terrafix.cosim.kernel_vector import VectorBinding
 from terrafix.cosim.kernels import Argument, BoundKernel, Kernel, Result, Specification
 from terrafix.cosim.messages import MessageReader, MessageWriter
 from terrafix.cosim.noise import stream_key
 from terrafix.cosim.parameters import Parameter
 from terrafix.cosim.ports import Capabilities
+from terrafix.cosim.stretch import Stage
 
 FloatArray = NDArray[np.float64]
+NOT_FINITE = "result is not finite"
 Symbols = Mapping[str, Any]
 
 
@@ -165,12 +168,12 @@ class SymbolicComponent(Component):
 
         arguments = [Argument(n, size(n), "array") for n in model.inputs]
         arguments += [Argument(f"state:{n}", size(n), "array") for n in model.states]
-        arguments += [Argument(n, size(n), "array") for n in model.parameters]
+        arguments += [Argument(n, size(n), "constant") for n in model.parameters]
         arguments += [Argument(n, size(n), "noise") for n in model.noise]
         if model.step is not None:
-            arguments.append(Argument("step", 1, "shared"))
+            arguments.append(Argument("step", 1, "step"))
         if model.time is not None:
-            arguments.append(Argument("time", 1, "shared"))
+            arguments.append(Argument("time", 1, "time"))
         results = [Result(n, size(n)) for n in model.outputs]
         results += [Result(f"state:{n}", size(n)) for n in model.states]
         return Specification(model.step_function(), arguments, results)
@@ -282,9 +285,21 @@ class SymbolicComponent(Component):
         if self._call(self.step_index):
             failed = self._failed.astype(np.bool_)
             self._failed[:] = 0
-            self.fail(failed, "result is not finite")
+            self.fail(failed, NOT_FINITE)
         if self._messages:
             self._publish_messages(t)
+
+    @property
+    def kernel_stage(self) -> Stage | None:
+        """What a stretch needs; None where a step is more than a call of a vector kernel."""
+        call = self._call
+        return call.stage if isinstance(call, VectorBinding) and not self._messages else None
+
+    def stretched(self, n_steps: int, t: float, dt: float) -> None:
+        """Note that a stretch made `n_steps` steps of this component, the last at `t` [s]."""
+        self.step_index += n_steps
+        self._t[0] = t
+        self._dt[0] = dt
 
     def _publish_messages(self, t: float) -> None:
         for name, valid in self._messages.items():

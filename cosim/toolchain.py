@@ -2,7 +2,7 @@
 
 A compiler is looked for in this order: the command in ``TERRAFIX_CC``, alone if it is given;
 ``cc``, ``gcc``, ``clang`` on the path; the clang of the ``ziglang`` wheel. One that turns out not
-to work is passed over. ``TERRAFIX_KERNEL=vm`` does without, ``TERRAFIX_KERNEL=c`` insists. None is
+to work is passed over. ``TERRAFIX_KERNEL=vm`` does without, ``vector`` and ``c`` insist. None is
 required: CasADi's virtual machine computes the same.
 
 Libraries are kept in ``TERRAFIX_CACHE``, or the user's cache directory, under a name made of the
@@ -44,6 +44,10 @@ loops of the driver. ``-march=native`` bought nothing for scalars and would tie 
 processor.
 """
 
+VECTOR_FLAGS = ("-O2", "-fno-math-errno", "-ffp-contract=off", "-march=native")
+"""For vectors, where the order of instructions matters: ``-O1`` runs two to three times longer.
+Registers are as wide as this processor's, whose name is part of the cache's key."""
+
 _LIBRARY = ("-shared", "-fvisibility=hidden", "-w")
 _SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 _PROBE = (
@@ -74,14 +78,13 @@ class Compiler:
     name: str
     version: str
 
-    @property
-    def options(self) -> tuple[str, ...]:
+    def options(self, *, native: bool) -> tuple[str, ...]:
         """What is written between the command and the source."""
         position = () if sys.platform == "win32" else ("-fPIC",)
-        return (*FLAGS, *position, *_LIBRARY)
+        return (*(VECTOR_FLAGS if native else FLAGS), *position, *_LIBRARY)
 
-    def compile(self, source: str) -> bytes:
-        """Compile `source` to a shared library.
+    def compile(self, source: str, *, native: bool = False) -> bytes:
+        """Compile `source` to a shared library, for this processor alone if `native`.
 
         Raises
         ------
@@ -91,7 +94,7 @@ class Compiler:
         with tempfile.TemporaryDirectory(prefix="terrafix-") as directory:
             file, library = Path(directory, "kernel.c"), Path(directory, f"kernel{_SUFFIX}")
             file.write_text(source)
-            command = [*self.command, *self.options, str(file), "-o", str(library), "-lm"]
+            command = [*self.command, *self.options(native=native), str(file), "-o", str(library), "-lm"]
             try:
                 done = subprocess.run(
                     command, capture_output=True, text=True, errors="replace", check=False
@@ -122,17 +125,17 @@ def find_compiler() -> Compiler | None:
     Raises
     ------
     ConfigurationError
-        If ``TERRAFIX_KERNEL`` is neither ``c`` nor ``vm``, or is ``c`` and no compiler works.
+        If ``TERRAFIX_KERNEL`` names no kind of kernel, or a compiled one and no compiler works.
     """
-    if _wanted() == "vm":
+    if wanted_kernel() == "vm":
         return None
     for command in _commands():
         compiler = _identify(command)
         if compiler and command not in _defects:
             return compiler
-    if _wanted() == "c":
+    if compilation_required():
         raise ConfigurationError(
-            f"TERRAFIX_KERNEL=c asks for compiled kernels, which cannot be had: {_why_none()}"
+            f"TERRAFIX_KERNEL={wanted_kernel()} asks for compiled kernels, which cannot be had: {_why_none()}"
         )
     return None
 
@@ -156,7 +159,17 @@ def working_compiler() -> Compiler:
 
 
 class _Kernel(Protocol):
+    kind: str
     note: str
+
+
+_KINDS = {"vector": "vectors of members", "c": "plain C"}
+
+
+def _kinds(kernels: Iterable[_Kernel]) -> str:
+    """What the compiled ones of `kernels` are; without any, what they would be."""
+    kinds = {k.kind for k in kernels} & set(_KINDS) or {wanted_kernel() or "vector"}
+    return " and ".join(_KINDS[kind] for kind in _KINDS if kind in kinds)
 
 
 def describe(kernels: Iterable[_Kernel] = ()) -> str:
@@ -168,22 +181,24 @@ def describe(kernels: Iterable[_Kernel] = ()) -> str:
     compiler = find_compiler()
     if compiler is None:
         return f"kernels: CasADi virtual machine ({_why_none()})"
+    kernels = list(kernels)
     refused = [kernel.note for kernel in kernels if kernel.note]
     rest = f"; CasADi virtual machine for {', '.join(refused)}" if refused else ""
-    return f"kernels: {compiler.name}, plain C{rest}"
+    return f"kernels: {compiler.name}, {_kinds(kernels)}{rest}"
 
 
 def compilation_required() -> bool:
     """Whether the user insists on compiled kernels."""
-    return _wanted() == "c"
+    return wanted_kernel() in ("vector", "c")
 
 
-def _wanted() -> str:
+def wanted_kernel() -> str:
+    """Kind of kernel that the user asks for; empty for the best there is."""
     wanted = os.environ.get("TERRAFIX_KERNEL", "")
-    if wanted not in ("", "c", "vm"):
+    if wanted not in ("", "vector", "c", "vm"):
         raise ConfigurationError(
-            f"TERRAFIX_KERNEL is '{wanted}'; write 'c' for compiled kernels, 'vm' for CasADi's "
-            "virtual machine, or leave it unset to take the best there is"
+            f"TERRAFIX_KERNEL is '{wanted}'; write 'vector' for vectors of members, 'c' for plain "
+            "C, 'vm' for CasADi's virtual machine, or leave it unset to take the best there is"
         )
     return wanted
 
@@ -234,7 +249,7 @@ def _works(compiler: Compiler) -> bool:
 
 
 def _why_none() -> str:
-    if _wanted() == "vm":
+    if wanted_kernel() == "vm":
         return "TERRAFIX_KERNEL=vm"
     chosen = os.environ.get("TERRAFIX_CC", "")
     defects = [_defects[command] for command in _commands() if command in _defects]
@@ -268,7 +283,7 @@ def _directories() -> Iterator[Path]:
     yield _session_directory()
 
 
-def load(source: str) -> ctypes.CDLL:
+def load(source: str, *, native: bool = False) -> ctypes.CDLL:
     """Load the library made from `source`, from the cache if it is there.
 
     The library carries its key, defined as ``TERRAFIX_KEY``, in a string ``terrafix_key``.
@@ -282,7 +297,7 @@ def load(source: str) -> ctypes.CDLL:
     """
     while compiler := find_compiler():
         try:
-            return _load(source, compiler)
+            return _load(source, compiler, native=native)
         except CompilationError:
             if _works(compiler):
                 raise
@@ -291,15 +306,28 @@ def load(source: str) -> ctypes.CDLL:
     raise CompilationError(_why_none())
 
 
-def _load(source: str, compiler: Compiler) -> ctypes.CDLL:
-    parts = (source, compiler.version, *compiler.options, sys.platform, platform.machine())
+@functools.cache
+def _processor() -> str:
+    """What this processor can do, as far as the system tells: native code is for it alone."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        told = {line for line in lines if line.startswith(("model name", "flags", "Features"))}
+        return "\n".join(sorted(told))
+    except OSError:
+        return platform.processor()
+
+
+def _load(source: str, compiler: Compiler, *, native: bool) -> ctypes.CDLL:
+    options = compiler.options(native=native)
+    parts = (source, compiler.version, *options, sys.platform, platform.machine())
+    parts += (_processor(),) if native else ()
     key = sha256("\0".join(parts).encode()).hexdigest()
     for directory in _directories():
         for path in directory.glob(f"{key}-*{_SUFFIX}"):
             library = _open_kept(path, key)
             if library:
                 return library
-    made = compiler.compile(f'#define TERRAFIX_KEY "{key}"\n{source}')
+    made = compiler.compile(f'#define TERRAFIX_KEY "{key}"\n{source}', native=native)
     for directory in _directories():
         try:
             path = _keep(made, key, directory)

@@ -40,11 +40,11 @@ def j2_acceleration(r: Any, mu: Any, radius: Any, j2: Any) -> Any:
     mu, radius, j2 : SX or float
         Gravitational parameter [m^3/s^2], equatorial radius [m], coefficient [-].
     """
-    squared = ca.dot(r, r)
-    inverse = 1 / squared
+    inverse_distance = 1 / ca.sqrt(ca.dot(r, r))
+    inverse = inverse_distance * inverse_distance
     oblate = 1.5 * j2 * radius * radius * inverse
     radial = 1 + oblate * (1 - 5 * r[2] * r[2] * inverse)
-    central = -mu * inverse / ca.sqrt(squared)
+    central = -mu * inverse * inverse_distance
     return central * ca.vertcat(radial * r[0], radial * r[1], (radial + 2 * oblate) * r[2])
 
 

@@ -24,6 +24,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from terrafix.models.division import sharing_reciprocals
+
 FloatArray = NDArray[np.float64]
 Symbols = Mapping[str, Any]
 """Names to CasADi SX symbols or expressions (CasADi carries no type information)."""
@@ -218,7 +220,7 @@ class Model:
         Inputs, states, parameters, noise, step and time, in this order, to outputs and states.
         """
         outputs = {k.replace("next:", "next_"): e for k, e in self.step_outputs.items()}
-        return self._function(name or f"{self.name}_step", outputs)
+        return sharing_reciprocals(self._function(name or f"{self.name}_step", outputs))
 
     def rate_function(self, name: str | None = None) -> Any:
         """Build outputs and derivatives of continuous states as a function.
