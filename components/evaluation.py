@@ -37,6 +37,10 @@ class NavigationEvaluation(Evaluation):
     velocity_sigma = Output((3,), unit="m/s", frame="e", labels=XYZ)
     misalignment_error = Output((3,), unit="rad", frame="s", labels=XYZ)
     misalignment_sigma = Output((3,), unit="rad", frame="s", labels=XYZ)
+    covariance = Output((9, 9), unit="1", doc="predicted, in SI: m, m/s, rad")
+    normalized_innovation = Output(
+        (4,), doc="innovation of the fix of this instant over its sigma; NaN where not measured"
+    )
     nees = Output(doc="normalized estimation error squared, 9 degrees of freedom")
     nis = Output(doc="normalized innovation squared of the fix of this instant")
     nis_dof = Output(doc="elements in that fix")
@@ -61,7 +65,12 @@ class NavigationEvaluation(Evaluation):
             self._views[f"{quantity.name}_error"][...] = error[:, part]
             self._views[f"{quantity.name}_sigma"][...] = sigma[:, part]
         self.nees = normalized_square(error, estimate.P)
+        self.covariance = estimate.P
         fresh = self.innovation.fresh
+        measured = fresh[:, None] & (self.innovation.residual != 0.0)
+        self.normalized_innovation = np.where(
+            measured, self.innovation.residual / self.innovation.sigma, np.nan
+        )
         self.nis = np.where(fresh, self.innovation.nis, np.nan)
         self.nis_dof = np.where(fresh, self.innovation.dof, np.nan)
         self.accepted = np.where(fresh, self.innovation.accepted, np.nan)

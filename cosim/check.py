@@ -11,6 +11,7 @@ import numpy as np
 
 from terrafix.cosim.clock import Rate, base_step, text_seconds
 from terrafix.cosim.component import Component
+from terrafix.cosim.dispersion import overridden
 from terrafix.cosim.errors import (
     ConfigurationError,
     RateError,
@@ -98,6 +99,7 @@ def check(system: System, *, duration: Fraction | None = None, outside: bool = F
         attempt(lambda r=record: record_rate(flat, r))  # type: ignore[misc]
     for dispersion in flat.dispersions:
         attempt(lambda d=dispersion: d.read_spread(flat.components))  # type: ignore[misc]
+    problems.extend(overridden(flat.dispersions))
     order: list[str] = []
 
     def find_order() -> None:

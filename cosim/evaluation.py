@@ -88,7 +88,9 @@ class Evaluation(Component):
     """Base of evaluation components. A subclass declares its ports and `quantities`.
 
     The error and sigma of quantity ``q`` are output ports ``q_error`` and ``q_sigma``, shape
-    (n_axes,). `nees` is optional in `summarize` of a subclass.
+    (n_axes,). What a campaign judges a filter by goes by these names, all optional: ``nees``;
+    ``covariance``, of all axes of all quantities in their order; ``nis`` with ``nis_dof``, and
+    ``normalized_innovation``, NaN where nothing was measured.
     """
 
     quantities: ClassVar[tuple[Quantity, ...]] = ()

@@ -383,11 +383,12 @@ def _dispersions(load: Load, system: System, tables: Mapping[str, dict[str, Any]
         spread = KINDS.get(kind, "sigma")
         targets = table.get("to", [])
         targets = [targets] if isinstance(targets, str) else targets
-        other = sorted(set(KINDS.values()) - {spread})[0]
-        if spread not in table and other in table:
-            load.refuse(f"{where} is {kind}: it takes {spread}, not {other}")
+        others = sorted((set(KINDS.values()) - {spread}) & set(table))
+        if spread not in table and others:
+            load.refuse(f"{where} is {kind}: it takes {spread}, not {others[0]}")
             continue
-        load.refuse_unknown(table, ("kind", "to", "doc", spread), where)
+        options = ("limit",) if kind == "truncated" else ()
+        load.refuse_unknown(table, ("kind", "to", "doc", "design", spread, *options), where)
         if spread not in table:
             load.refuse(f'{where} needs a {spread}\n  write it with its unit, {spread} = "1.0 m"')
         elif not isinstance(targets, list) or not all(isinstance(t, str) for t in targets):
@@ -396,7 +397,24 @@ def _dispersions(load: Load, system: System, tables: Mapping[str, dict[str, Any]
                 '  write to = ["orbit.r0_i"]'
             )
         elif not load.is_lost(targets):
-            dispersion = Dispersion(name, tuple(targets), table[spread], kind=kind)
+            limit = load.attempt(_limit, table.get("limit", 3.0), where)
+            dispersion = Dispersion(
+                name,
+                tuple(targets),
+                table[spread],
+                kind=kind,
+                design=str(table.get("design", "random")),
+                limit=3.0 if limit is None else limit,
+            )
             load.attempt(system.disperse, dispersion)
             bare = f"dispersion.{name}.{spread}" in load.bare
             load.attempt(dispersion.read_spread, components, bare=bare)
+
+
+def _limit(value: object, where: str) -> float:
+    try:
+        return float(str(value))
+    except ValueError:
+        raise ConfigurationError(
+            f"{where}: limit is {shown(value)}; it is a number of sigma, such as 3"
+        ) from None

@@ -27,6 +27,8 @@ def configuration(plan: Plan) -> dict[str, Any]:
         "records": {r.name: {"ports": list(r.ports), "rate": str(r.rate)} for r in flat.records},
         "dispersions": {
             d.name: {"kind": d.kind, "spread": str(d.spread), "to": list(d.targets)}
+            | ({"design": d.design} if d.design != "random" else {})
+            | ({"limit": d.limit} if d.kind == "truncated" else {})
             for d in flat.dispersions
         },
     }

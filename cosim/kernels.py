@@ -68,7 +68,7 @@ def build_kernels(
     if toolchain.find_compiler() is None:
         return virtual
     candidates = [_candidates(kernel) for kernel in virtual]
-    loaded: dict[str, ctypes.CDLL | toolchain.CompilationError] = {}
+    loaded: dict[str, _Loaded] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         todo = {c.source: c for found in candidates for c in found[:1]}
         while todo:
@@ -76,15 +76,24 @@ def build_kernels(
                 pool.submit(toolchain.load, source, native=c.native): source
                 for source, c in todo.items()
             }
-            for future in as_completed(futures):
+            for done, future in enumerate(as_completed(futures), 1):
                 try:
                     loaded[futures[future]] = future.result()
                 except toolchain.CompilationError as error:
                     loaded[futures[future]] = error
                 if progress:
-                    progress(len(loaded), len({c.source for found in candidates for c in found}))
-            todo = {c.source: c for found in candidates if (c := _next(found, loaded))}
+                    progress(done, len(futures))
+            todo = {}
+            for kernel, found in zip(virtual, candidates, strict=True):
+                refused = isinstance(loaded[found[-1].source], toolchain.CompilationError)
+                if refused and found[-1].native and toolchain.wanted_kernel() != "vector":
+                    found.append(_plain(kernel))
+                    if found[-1].source not in loaded:
+                        todo[found[-1].source] = found[-1]
     return [_made(*each, loaded) for each in zip(specifications, virtual, candidates, strict=True)]
+
+
+_Loaded = ctypes.CDLL | toolchain.CompilationError
 
 
 class _Candidate(NamedTuple):
@@ -96,47 +105,35 @@ class _Candidate(NamedTuple):
 
 
 def _candidates(kernel: Kernel) -> list[_Candidate]:
-    """Ways to make a kernel, the best first."""
+    """Choose the best way to make a kernel, alone in a list; others follow if it is refused."""
     wanted = toolchain.wanted_kernel()
-    found = []
-    refusal = ""
-    if wanted != "c":
-        try:
-            source, n_invariants = vector_source(kernel)
+    if wanted == "c":
+        return [_plain(kernel)]
+    try:
+        source, n_invariants = vector_source(kernel)
+    except NoVectors as error:
+        if wanted == "vector":
+            raise ConfigurationError(
+                f"TERRAFIX_KERNEL=vector asks for vector kernels, and '{kernel.name}' cannot be "
+                f"one: {error}"
+            ) from error
+        return [_plain(kernel)]
 
-            def make(specification: Specification, library: ctypes.CDLL) -> Kernel:
-                return VectorKernel(specification, library, n_invariants)
+    def make(specification: Specification, library: ctypes.CDLL) -> Kernel:
+        return VectorKernel(specification, library, n_invariants)
 
-            found.append(_Candidate(source, True, make))
-        except NoVectors as error:
-            refusal = str(error)
-    if wanted != "vector":
-        found.append(_Candidate(kernel_source(kernel), False, CompiledKernel))
-    elif refusal:
-        raise ConfigurationError(
-            f"TERRAFIX_KERNEL=vector asks for vector kernels, and '{kernel.name}' cannot be one: "
-            f"{refusal}"
-        )
-    return found
+    return [_Candidate(source, True, make)]
 
 
-def _next(
-    candidates: list[_Candidate], loaded: dict[str, ctypes.CDLL | toolchain.CompilationError]
-) -> _Candidate | None:
-    """The next candidate to try: none once one is loaded, or all have failed."""
-    for candidate in candidates:
-        if candidate.source not in loaded:
-            return candidate
-        if not isinstance(loaded[candidate.source], toolchain.CompilationError):
-            return None
-    return None
+def _plain(kernel: Kernel) -> _Candidate:
+    return _Candidate(kernel_source(kernel), False, CompiledKernel)
 
 
 def _made(
     specification: Specification,
     virtual: Kernel,
     candidates: list[_Candidate],
-    loaded: dict[str, ctypes.CDLL | toolchain.CompilationError],
+    loaded: dict[str, _Loaded],
 ) -> Kernel:
     """The best kernel that could be made; the virtual machine if none could."""
     for candidate in candidates:

@@ -20,6 +20,7 @@ from terrafix.cosim.build import Wiring, bind_components, connect_ports
 from terrafix.cosim.check import Plan
 from terrafix.cosim.clock import Rate
 from terrafix.cosim.component import Component
+from terrafix.cosim.dispersion import apply_all
 from terrafix.cosim.errors import ConfigurationError, StepError, TerrafixError
 from terrafix.cosim.links import CopyMessage, DelayLine, Transfer
 from terrafix.cosim.messages import MessageReader
@@ -97,6 +98,8 @@ class Master:
         Root seed.
     members : ndarray of int64
         Numbers of the members to fly.
+    runs : int, optional
+        How many members there are in all, where these are a part.
 
     Attributes
     ----------
@@ -108,7 +111,9 @@ class Master:
     component_steps : int
     """
 
-    def __init__(self, plan: Plan, *, seed: int, members: NDArray[np.int64]) -> None:
+    def __init__(
+        self, plan: Plan, *, seed: int, members: NDArray[np.int64], runs: int | None = None
+    ) -> None:
         self.plan = plan
         self.seed = seed
         self.members = members
@@ -120,10 +125,13 @@ class Master:
         bind_components(plan, seed=seed, members=members, active=self.active, fail=self._exclude)
         self._lent = {p: c.environment for p, c in plan.flat.components.items()}
         self._terminated = False
-        self.draws = {
-            d.name: d.apply(plan.flat.components, seed=seed, members=members)
-            for d in plan.flat.dispersions
-        }
+        self.draws = apply_all(
+            plan.flat.dispersions,
+            plan.flat.components,
+            seed=seed,
+            members=members,
+            runs=int(members.max()) + 1 if runs is None else runs,
+        )
         self.wiring = connect_ports(plan, len(members), self.active)
         self._groups: list[_Group] = []
         self._group_of: dict[str, int] = {}

@@ -41,6 +41,7 @@ def simulate(
     system: System,
     *,
     members: int | Sequence[int] | None = None,
+    runs: int | None = None,
     seed: int | None = None,
     duration: Exact | None = None,
     out: str | Path | None = None,
@@ -56,6 +57,8 @@ def simulate(
     system : System
     members : int or sequence of int, optional
         How many, or which.
+    runs : int, optional
+        How many there are in all, where `members` are some of a campaign's.
     seed : int, optional
         Root seed.
     duration : exact time, optional
@@ -91,7 +94,13 @@ def simulate(
     saved = None if resume is None else read_checkpoint(Path(resume))
     places = _places(system, out, checkpoint, resume, saved, checkpointing=every is not None)
     simulation = Simulation(
-        system, members=members, seed=seed, duration=length, folder=places.folder, progress=progress
+        system,
+        members=members,
+        runs=runs,
+        seed=seed,
+        duration=length,
+        folder=places.folder,
+        progress=progress,
     )
     keep = True
     try:

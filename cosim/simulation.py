@@ -99,6 +99,11 @@ class Simulation:
         Root seed; the system's own if absent.
     duration : exact time, optional
         How long it will run [s]: recordings that end earlier are refused.
+    runs : int, optional
+        How many members there are in all, where `members` are a part of them: designs are laid
+        out over all.
+    recording : bool
+        Whether the system's records are taken; what evaluations publish always is.
     folder : Path, optional
         Where records are kept while the run goes on.
 
@@ -120,6 +125,8 @@ class Simulation:
         members: int | Sequence[int] | None = None,
         seed: int | None = None,
         duration: Exact | None = None,
+        runs: int | None = None,
+        recording: bool = True,
         folder: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
@@ -135,9 +142,9 @@ class Simulation:
         self.folder = folder
         self.checkpoint: Path | None = None
         try:
-            self.master = Master(self.plan, seed=self.seed, members=self.members)
+            self.master = Master(self.plan, seed=self.seed, members=self.members, runs=runs)
             self.kernel = self._build_kernels(progress)
-            self.recorders = self._make_recorders()
+            self.recorders = self._make_recorders(recording=recording)
         except BaseException:
             for component in self.plan.flat.components.values():
                 component.release()
@@ -153,18 +160,24 @@ class Simulation:
         }
         if not symbolic:
             return "none"
-        requests = [c.kernel_request() for c in symbolic.values()]
+        new = [c for c in symbolic.values() if c.kept_kernel is None]
+        requests = [c.kernel_request() for c in new]
 
         def report(done: int, total: int) -> None:
             if progress is not None:
                 progress("compiling kernels", done / total)
 
-        kernels = build_kernels(requests, progress=report)
-        for component, kernel in zip(symbolic.values(), kernels, strict=True):
+        for component, kernel in zip(new, build_kernels(requests, progress=report), strict=True):
+            component.keep_kernel(kernel)
+        kinds = set()
+        for component in symbolic.values():
+            kernel = component.kept_kernel
+            assert kernel is not None
             component.bind_kernel(kernel)
-        return "+".join(sorted({k.kind for k in kernels}))
+            kinds.add(kernel.kind)
+        return "+".join(sorted(kinds))
 
-    def _make_recorders(self) -> list[Recorder]:
+    def _make_recorders(self, *, recording: bool) -> list[Recorder]:
         recorders = []
         flat, wiring = self.plan.flat, self.master.wiring
 
@@ -176,7 +189,7 @@ class Simulation:
                 slots[path] = (flat.port(path), slot)
             return Recorder(name, slots, self.master.active, self.folder)
 
-        for record in flat.records:
+        for record in flat.records if recording else ():
             made = recorder(record.name, record.ports)
             self.master.observe(record_rate(flat, record), made.sample)
             recorders.append(made)
@@ -202,9 +215,12 @@ class Simulation:
             for target in dispersion.targets:
                 owner, _, name = target.rpartition(".")
                 component = self.plan.flat.components[owner]
-                declared = component.settings()[name]
-                assert isinstance(declared, Parameter)
-                found[target] = (declared.unit_text(), component._settings[name].copy())
+                declared = component.settings().get(name)
+                if isinstance(declared, Parameter):
+                    found[target] = (declared.unit_text(), component._settings[name].copy())
+                else:
+                    unit = component._declared[name].field.unit_text()
+                    found[target] = (unit, component._states[name].copy())
         return found
 
     # ------------------------------------------------------------------ running
@@ -298,15 +314,18 @@ class Simulation:
         ]
         return [f"output '{path}' was never published" for path in silent]
 
+    def history(self, path: str) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
+        """What an evaluation component published so far: times, and arrays by port name."""
+        times, arrays = self._histories[path].history()
+        return times, {n.removeprefix(f"{path}."): a for n, a in arrays.items()}
+
     def evaluate(self) -> dict[str, Any]:
         """What evaluation components publish, from what was recorded so far."""
         found = {}
-        for path, recorder in self._histories.items():
+        for path in self._histories:
             component = self.plan.flat.components[path]
             assert isinstance(component, Evaluation)
-            times, arrays = recorder.history()
-            history = {n.removeprefix(f"{path}."): a for n, a in arrays.items()}
-            found[path] = component.summarize(times, history)
+            found[path] = component.summarize(*self.history(path))
         return next(iter(found.values())) if len(found) == 1 else found
 
     def result(self, *, wall_s: float, status: str = "complete") -> Result:

@@ -116,7 +116,7 @@ class Places:
                 f"'{self.folder}'\n"
                 "  a run that has ended keeps them in its result; start again without --resume"
             )
-        self._lock = _locked(self.folder)
+        self._lock = locked(self.folder)
         if not resumed:
             rescued = rescue(self.folder)
             if rescued is not None:
@@ -143,7 +143,7 @@ def _lock_file(folder: Path) -> Path:
     return folder.with_suffix(".lock")
 
 
-def _locked(folder: Path) -> IO[str]:
+def locked(folder: Path) -> IO[str]:
     """Open the folder's lock file for this process alone; the system frees it when we die."""
     file = _lock_file(folder).open("w")
     try:

@@ -12,6 +12,7 @@ sent.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 
@@ -28,6 +29,7 @@ from terrafix.cosim.noise import stream_key
 from terrafix.cosim.parameters import Parameter
 from terrafix.cosim.ports import Capabilities
 from terrafix.cosim.stretch import Stage
+from terrafix.cosim.toolchain import cache_directory, wanted_kernel
 
 FloatArray = NDArray[np.float64]
 NOT_FINITE = "result is not finite"
@@ -113,6 +115,22 @@ class SymbolicComponent(Component):
         return self._model[1]
 
     _model: tuple[Any, SymbolicModel] | None = None
+    _kept: tuple[Any, Kernel] | None = None
+
+    @property
+    def kept_kernel(self) -> Kernel | None:
+        """The kernel of an earlier simulation of this component, if it would be made alike now."""
+        now = (id(self.model), _asked_for())
+        return self._kept[1] if self._kept is not None and self._kept[0] == now else None
+
+    def keep_kernel(self, kernel: Kernel) -> None:
+        """Keep a kernel for later simulations."""
+        self._kept = ((id(self.model), _asked_for()), kernel)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to another process: neither models nor kernels, which are made there."""
+        left = {"_model", "_kept", "kernel", "_call"}
+        return {k: v for k, v in self.__dict__.items() if k not in left}
 
     def validate(self) -> None:
         """Check that every name of the model is a port or parameter of this component."""
@@ -251,23 +269,22 @@ class SymbolicComponent(Component):
             if port.needed_at_start:
                 self.fail(~self._views[name].fresh, f"no '{name}' was received at t = 0")
         function = model.initial_function()
-        inputs = [self._input_array(n).reshape(self.n_members, -1) for n in model.inputs]
-        inputs += [self._settings[n].reshape(self.n_members, -1) for n in model.parameters]
-        inputs += [self.normals(n, int(np.prod(model.shape(n)))) for n in model.noise]
+        rows = [self._input_array(n).reshape(self.n_members, -1) for n in model.inputs]
+        rows += [self._settings[n].reshape(self.n_members, -1) for n in model.parameters]
+        rows += [self.normals(n, int(np.prod(model.shape(n)))) for n in model.noise]
         clock = [0.0] * ((model.step is not None) + (model.time is not None))
-        outputs = {n: self._output_array(n) for n in model.outputs}
-        targets = [*outputs.values(), *(self._states[n] for n in model.states)]
-        for m in range(self.n_members):
-            if not env.active[m]:
-                continue
-            results = function(*(a[m] for a in inputs), *clock)
-            results = results if isinstance(results, tuple) else (results,)
-            values = [np.asarray(r, dtype=np.float64).reshape(-1) for r in results]
-            if not all(np.isfinite(v).all() for v in values):
-                self.fail(env.members == env.members[m], self._unfinished_start(m))
-                continue
-            for target, value in zip(targets, values, strict=True):
-                target[m] = value.reshape(target.shape[1:])
+        targets = [*(self._output_array(n) for n in model.outputs)]
+        targets += [self._states[n] for n in model.states]
+        flying = np.flatnonzero(env.active)
+        values = _each_member(function, [r[flying] for r in rows], clock, len(flying))
+        finite = np.ones(len(flying), dtype=np.bool_)
+        for value in values:
+            finite &= np.isfinite(value).all(axis=1)
+        for m in flying[~finite]:
+            self.fail(env.members == env.members[m], self._unfinished_start(m))
+        started = flying[finite]
+        for target, value in zip(targets, values, strict=True):
+            target[started] = value[finite].reshape(-1, *target.shape[1:])
         if self.publishes_at_start:
             self._publish_messages(0.0)
 
@@ -306,3 +323,21 @@ class SymbolicComponent(Component):
             mask = valid > 0.5
             if mask.any():
                 self._views[name].publish_draft(t, mask)
+
+
+def _asked_for() -> tuple[str, ...]:
+    """What of the user's environment decides how kernels are made."""
+    return wanted_kernel(), os.environ.get("TERRAFIX_CC", ""), str(cache_directory())
+
+
+def _each_member(
+    function: Any, rows: list[FloatArray], clock: list[float], n_members: int
+) -> list[FloatArray]:
+    """Evaluate a function of columns for every member: results of shape (n_members, size)."""
+    if not n_members:
+        return [np.empty((0, function.numel_out(i))) for i in range(function.n_out())]
+    whole = function.map(n_members)
+    columns = [np.asfortranarray(r.T) for r in rows]
+    results = whole(*columns, *(np.full((1, n_members), value) for value in clock))
+    results = results if isinstance(results, tuple | list) else (results,)
+    return [np.asarray(r, dtype=np.float64).T for r in results]

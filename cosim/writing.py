@@ -79,9 +79,12 @@ def system_text(system: System) -> str:
         lines += _record_lines(record, [port(p) for p in record.ports])
     for d in flat.dispersions:
         spread = KINDS[d.kind]
-        declared = d.parameter(flat.components)
-        value = declared.write(d.read_spread(flat.components))
+        value = d.write_spread(flat.components)
         lines += ["", f"[dispersion.{d.name.replace('.', '_')}]", f'kind = "{d.kind}"']
+        if d.design != "random":
+            lines.append(f'design = "{d.design}"')
+        if d.kind == "truncated":
+            lines.append(f"limit = {d.limit!r}")
         lines += [f"{spread} = {_toml(value)}", f"to = {_toml([port(t) for t in d.targets])}"]
     return "\n".join(lines) + "\n"
 

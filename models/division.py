@@ -8,9 +8,17 @@ model, before any code is made of it, so that every kernel and every FMU compute
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
+
+
+class _Instruction(NamedTuple):
+    """One instruction of an SX function: what it does, and the registers it reads and writes."""
+
+    kind: int
+    inputs: list[int]
+    outputs: list[int]
 
 
 def sharing_reciprocals(function: Any) -> Any:
@@ -28,31 +36,33 @@ def sharing_reciprocals(function: Any) -> Any:
     Function
         Of the same name, arguments and results.
     """
-    n = function.n_instructions()
-    kinds = [function.instruction_id(k) for k in range(n)]
-    if ca.OP_DIV not in kinds:
-        return function
-    inputs = [function.instruction_input(k) for k in range(n)]
-    outputs = [function.instruction_output(k) for k in range(n)]
-
+    code = [
+        _Instruction(
+            function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+        )
+        for k in range(function.n_instructions())
+    ]
     writer: dict[int, int] = {}  # register to the instruction that wrote it last
     divisor: dict[int, int] = {}  # division to the instruction that made its divisor
-    for k in range(n):
-        if kinds[k] in (ca.OP_DIV, ca.OP_INV):
-            divisor[k] = writer[inputs[k][-1]]
-        if kinds[k] != ca.OP_OUTPUT:
-            writer[outputs[k][0]] = k
+    for k, (kind, inputs, outputs) in enumerate(code):
+        if kind in (ca.OP_DIV, ca.OP_INV):
+            divisor[k] = writer[inputs[-1]]
+        if kind != ca.OP_OUTPUT:
+            writer[outputs[0]] = k
+    if not divisor:
+        return function
     shared = {made for made, count in Counter(divisor.values()).items() if count > 1}
-
     simplifying = ca.GlobalOptions.getSimplificationOnTheFly()
     ca.GlobalOptions.setSimplificationOnTheFly(False)  # it would turn x (1/y) back to x/y
     try:
-        return _rewritten(function, divisor, shared)
+        return _rewritten(function, code, divisor, shared)
     finally:
         ca.GlobalOptions.setSimplificationOnTheFly(simplifying)
 
 
-def _rewritten(function: Any, divisor: dict[int, int], shared: set[int]) -> Any:
+def _rewritten(
+    function: Any, code: list[_Instruction], divisor: dict[int, int], shared: set[int]
+) -> Any:
     """Repeat the instructions; divide by multiplying where the divisor's maker is in `shared`."""
     arguments = [
         ca.SX.sym(function.name_in(i), function.numel_in(i)) for i in range(function.n_in())
@@ -61,9 +71,7 @@ def _rewritten(function: Any, divisor: dict[int, int], shared: set[int]) -> Any:
     results = [[ca.SX(0)] * function.numel_out(i) for i in range(function.n_out())]
     register: dict[int, Any] = {}
     reciprocal: dict[int, Any] = {}
-    for k in range(function.n_instructions()):
-        kind = function.instruction_id(k)
-        inputs, outputs = function.instruction_input(k), function.instruction_output(k)
+    for k, (kind, inputs, outputs) in enumerate(code):
         if kind == ca.OP_OUTPUT:
             results[outputs[0]][outputs[1]] = register[inputs[0]]
             continue

@@ -309,6 +309,122 @@ def _draw(result: Result, figure: Path, *, failed: bool) -> bool:
 
 @main.command()
 @_system
+@click.option("--runs", type=click.IntRange(min=1), metavar="N", help="Members of the campaign.")
+@_set
+@click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Root seed.")
+@click.option("--duration", metavar="S", help='Simulated time, exact: "590.4" or "10 min".')
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes to fly it.")
+@click.option("--dask", metavar="ADDRESS|local:N", help="Fly it on a Dask cluster.")
+@click.option("--out", metavar="DIR", help="Folder to keep the campaign in.")
+@click.option("--resume", is_flag=True, help="Complete what is in --out.")
+@click.option("--histories", is_flag=True, help="Keep full records of all members, in --out.")
+@click.option("--member", type=click.IntRange(min=0), metavar="K", help="Repeat one member alone.")
+@_json
+@click.option("--quiet", is_flag=True, help="Nothing but errors on standard error.")
+def campaign(
+    system: str,
+    runs: int | None,
+    settings: Settings,
+    seed: int | None,
+    duration: str | None,
+    workers: int | None,
+    dask: str | None,
+    out: str | None,
+    resume: bool,
+    histories: bool,
+    member: int | None,
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    """Fly many members of a system, and judge its filter.
+
+    With --member K, fly that member alone, with full records: to --out FILE.nc.
+    """
+    from terrafix.progress import ProgressBar, stderr_is_terminal
+
+    if dask is not None and workers is not None:
+        raise ConfigurationError(
+            "--dask and --workers both say who flies the campaign\n  give one of them"
+        )
+    runs = _runs(runs, out, resume=resume)
+    if member is not None:
+        return _one_member(
+            system, settings, member, runs, seed=seed, duration=duration, out=out, as_json=as_json
+        )
+    with ProgressBar(shown=not quiet and stderr_is_terminal(), first="preparing") as progress:
+        from terrafix.cosim.campaign.batch import FileSource
+        from terrafix.cosim.campaign.campaign import run_campaign
+
+        ssp = Path(system).suffix.lower() == ".ssp"
+        source = _read(system, settings) if ssp else FileSource(str(system), tuple(settings))
+        result = run_campaign(
+            source,
+            runs=runs,
+            seed=seed,
+            duration=duration,
+            workers=workers,
+            dask=dask,
+            out=out,
+            resume=resume,
+            histories=histories,
+            progress=progress,
+        )
+    if as_json:
+        _print_json(result.summary())
+    else:
+        from terrafix.cosim.campaign.display import campaign_tables
+
+        _show(*campaign_tables(result, system))
+    return 0
+
+
+def _runs(runs: int | None, out: str | None, *, resume: bool) -> int:
+    """How many members: as said, or as the folder says that is resumed."""
+    if runs is not None:
+        return runs
+    if resume and out is not None:
+        from terrafix.cosim.campaign.store import read_manifest
+
+        return int(read_manifest(Path(out))["runs"])
+    raise ConfigurationError("a campaign needs a number of members\n  give --runs 100")
+
+
+def _one_member(
+    system: str,
+    settings: Settings,
+    member: int,
+    runs: int,
+    *,
+    seed: int | None,
+    duration: str | None,
+    out: str | None,
+    as_json: bool,
+) -> int:
+    from terrafix.cosim.tables import result_tables
+    from terrafix.cosim.run import simulate
+
+    if member >= runs:
+        raise ConfigurationError(
+            f"there is no member {member} among {runs} runs\n  members are numbered from 0"
+        )
+    target = _target("--out", out, (".nc",))
+    result = simulate(
+        _read(system, settings),
+        members=[member],
+        runs=runs,
+        seed=seed,
+        duration=duration,
+        out=target,
+    )
+    if as_json:
+        _print_json(result.summary())
+    else:
+        _show(*result_tables(result))
+    return 0
+
+
+@main.command()
+@_system
 @_set
 @_json
 def check(system: str, settings: Settings, as_json: bool) -> None:

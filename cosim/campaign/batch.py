@@ -1,0 +1,270 @@
+"""A batch: consecutive members of a campaign flown together, summed up block by block.
+
+A batch is what a worker is given. It knows the campaign (`Task`) and which members are its own,
+and returns blocks; two batches know nothing of one another.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.cosim.campaign.statistics import BLOCK, Block, Layout, block_of
+from terrafix.cosim.errors import ConfigurationError, StepError
+from terrafix.cosim.evaluation import Evaluation
+from terrafix.cosim.simulation import Simulation
+from terrafix.cosim.system import System
+
+BATCH_BYTES = 48 * 2**20
+"""Of evaluation histories that a batch holds in memory: this decides how many members it has."""
+LARGEST = 512
+
+
+@dataclass(frozen=True)
+class FileSource:
+    """A system as a worker can read it: its file and what was set on the command line."""
+
+    path: str
+    settings: tuple[tuple[str, str], ...] = ()
+
+    def read(self) -> System:
+        """Read the file."""
+        from terrafix.cosim.files import read_system
+
+        return read_system(self.path, list(self.settings))
+
+
+@dataclass(frozen=True)
+class Task:
+    """What every batch of a campaign has in common.
+
+    Attributes
+    ----------
+    source : FileSource or System
+        Where workers get the system from.
+    runs : int
+        Members in all.
+    seed : int
+    duration : Fraction
+        [s]
+    histories : str or None
+        Folder for full records, one NetCDF file per block.
+    """
+
+    source: FileSource | System
+    runs: int
+    seed: int
+    duration: Fraction
+    histories: str | None = None
+
+
+@dataclass
+class BlockResult:
+    """What a batch returns for each block of members.
+
+    Attributes
+    ----------
+    number : int
+    sums : dict of str to Block
+        By evaluation component.
+    parameters : dict of str to ndarray
+        Dispersed parameters as they reached the components, (n_members, ...).
+    excluded : list of dict
+        Members that failed.
+    kernel : str
+    """
+
+    number: int
+    sums: dict[str, Block]
+    parameters: dict[str, NDArray[Any]]
+    excluded: list[dict[str, Any]]
+    kernel: str
+
+
+@lru_cache(maxsize=2)
+def _system(source: FileSource | System) -> System:
+    """The system, read once in each process: its models and kernels are kept."""
+    return source.read() if isinstance(source, FileSource) else source
+
+
+def layouts(simulation: Simulation, duration: Fraction) -> dict[str, Layout]:
+    """What the evaluation components publish, and when."""
+    plan = simulation.plan
+    found = {}
+    for path, component in plan.flat.components.items():
+        if isinstance(component, Evaluation):
+            assert component.rate is not None
+            end = int(duration / plan.base)
+            ticks = [0] if component.rate.starts_at_zero else []
+            for tick in component.rate.ticks(plan.base, plan.grid):
+                if tick > end:
+                    break
+                ticks.append(tick)
+            times = np.array([simulation.master.seconds(tick) for tick in ticks])
+            found[path] = Layout.of(path, component, times)
+    if not found:
+        raise ConfigurationError(
+            f"system '{simulation.system.name}' has no evaluation component, so a campaign would "
+            "have no statistics\n  add one, such as navigation_evaluation, or use terrafix run"
+        )
+    return found
+
+
+def members_per_batch(simulation: Simulation, found: Mapping[str, Layout]) -> int:
+    """Members whose histories fit into `BATCH_BYTES`: a whole number of blocks."""
+    one = 0
+    for path, layout in found.items():
+        component = simulation.plan.flat.components[path]
+        row = sum(f.size for p in component.outputs().values() for f in p.fields.values())
+        one += 8 * 4 * row * len(layout.times)  # in the recorder, joined, and cut
+    return BLOCK * max(1, min(LARGEST, BATCH_BYTES // max(one, 1)) // BLOCK)
+
+
+def fly_batch(task: Task, first: int, last: int) -> list[BlockResult]:
+    """Fly members `first` up to `last`, not included; `first` begins a block.
+
+    Raises
+    ------
+    ConfigurationError
+        If the system cannot be flown at all.
+    StepError
+        If a component fails for every member by itself.
+    """
+    system = _system(task.source)
+    members = np.arange(first, last)
+    try:
+        return _blocks(*_fly(task, system, members))
+    except StepError:
+        pass  # of one member, perhaps: alone, the others are not held up
+    parts = [_fly(task, system, np.array([m]), alone=True) for m in members.tolist()]
+    return _blocks(*_joined(parts))
+
+
+_Flight = tuple[Task, Simulation, NDArray[np.int64], dict[str, dict[str, NDArray[Any]]], Any, Any]
+
+
+def _fly(
+    task: Task, system: System, members: NDArray[np.int64], *, alone: bool = False
+) -> _Flight:
+    """Fly some members; histories by evaluation component, padded where nobody was left."""
+    simulation = Simulation(
+        system,
+        members=members.tolist(),
+        seed=task.seed,
+        duration=task.duration,
+        runs=task.runs,
+        recording=task.histories is not None,
+    )
+    try:
+        excluded = simulation.master.excluded
+        try:
+            simulation.initialize()
+            simulation.run_until(task.duration)
+        except StepError as error:
+            if simulation.master.active.any():  # a component failed, and not a member
+                if not alone:
+                    raise
+                excluded.append(
+                    {
+                        "member": int(members[0]),
+                        "component": "",
+                        "t_s": simulation.master.seconds(simulation.master.tick),
+                        "reason": str(error),
+                    }
+                )
+        if task.histories is not None:
+            _write_histories(task, simulation, members)
+        histories = {
+            path: _padded(simulation.history(path), layout)
+            for path, layout in layouts(simulation, task.duration).items()
+        }
+        return task, simulation, members, histories, list(excluded), dict(simulation.parameters)
+    finally:
+        simulation.master.terminate()
+
+
+def _padded(
+    found: tuple[NDArray[np.float64], dict[str, NDArray[Any]]], layout: Layout
+) -> dict[str, NDArray[Any]]:
+    times, arrays = found
+    missing = len(layout.times) - len(times)
+    if not missing:
+        return arrays
+    return {
+        name: np.concatenate([a, np.full((missing, *a.shape[1:]), np.nan)])
+        for name, a in arrays.items()
+    }
+
+
+def _joined(parts: list[_Flight]) -> _Flight:
+    """Members that were flown one by one, side by side."""
+    task, simulation = parts[0][:2]
+    histories = {
+        path: {
+            name: np.concatenate([p[3][path][name] for p in parts], axis=1)
+            for name in parts[0][3][path]
+        }
+        for path in parts[0][3]
+    }
+    parameters = {
+        name: (unit, np.concatenate([p[5][name][1] for p in parts]))
+        for name, (unit, _) in parts[0][5].items()
+    }
+    members = np.concatenate([p[2] for p in parts])
+    return task, simulation, members, histories, sum((p[4] for p in parts), []), parameters
+
+
+def _blocks(
+    task: Task,
+    simulation: Simulation,
+    members: NDArray[np.int64],
+    histories: dict[str, dict[str, NDArray[Any]]],
+    excluded: list[dict[str, Any]],
+    parameters: dict[str, tuple[str, NDArray[Any]]],
+) -> list[BlockResult]:
+    found = layouts(simulation, task.duration)
+    results = []
+    for start in range(0, len(members), BLOCK):
+        part = slice(start, start + BLOCK)
+        first = int(members[start])
+        sums = {}
+        for path, layout in found.items():
+            cut = {name: np.ascontiguousarray(a[:, part]) for name, a in histories[path].items()}
+            sums[path] = block_of(layout, cut, first=first)
+        mine = set(members[part].tolist())
+        results.append(
+            BlockResult(
+                first // BLOCK,
+                sums,
+                {name: values[part].copy() for name, (_, values) in parameters.items()},
+                sorted((e for e in excluded if e["member"] in mine), key=lambda e: e["member"]),
+                simulation.kernel,
+            )
+        )
+    return results
+
+
+def _write_histories(task: Task, simulation: Simulation, members: NDArray[np.int64]) -> None:
+    from terrafix.cosim.results import write_netcdf
+
+    assert task.histories is not None
+    folder = Path(task.histories)
+    folder.mkdir(parents=True, exist_ok=True)
+    dataset = simulation.result(wall_s=0.0, status="part of a campaign").dataset
+    for start in range(0, len(members), BLOCK):
+        part = dataset.isel(member=slice(start, start + BLOCK))
+        part.attrs |= {"excluded": "", "evaluation": "", "members": str(members[start : start + BLOCK])}
+        write_netcdf(part, folder / f"{int(members[start]) // BLOCK:06d}.nc")
+
+
+def single_threaded() -> None:
+    """Say that this process is one of several: members are not stepped in threads of its own."""
+    os.environ["TERRAFIX_THREADS"] = "1"

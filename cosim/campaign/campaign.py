@@ -1,0 +1,404 @@
+"""One call from a system to the statistics of many members, and the verdict.
+
+result = run_campaign(FileSource("system.toml"), runs=100)
+print(result.verdicts["evaluation"].text)
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from terrafix.cosim.campaign import pools
+from terrafix.cosim.campaign.batch import (
+    BlockResult,
+    FileSource,
+    Task,
+    layouts,
+    members_per_batch,
+)
+from terrafix.cosim.campaign.results import build_result, summary_of
+from terrafix.cosim.campaign.statistics import BLOCK, SHOWN, Statistics
+from terrafix.cosim.campaign.store import RESULT, SUMMARY, Store
+from terrafix.cosim.campaign.verdict import Verdict, judge
+from terrafix.cosim.clock import Exact, seconds, text_seconds
+from terrafix.cosim.errors import ConfigurationError, RateError, StepError, TerrafixError
+from terrafix.cosim.identity import configuration
+from terrafix.cosim.record import write_atomically
+from terrafix.cosim.simulation import MAX_MEMBER, Simulation
+from terrafix.cosim.system import System
+
+Progress = Callable[[str, float], None]
+MOST_NAMED = 1000
+"""Failed members listed in a result; all are counted, and all are in the blocks."""
+
+
+class CampaignError(StepError):
+    """A campaign that ended early; what is done is in its folder, if it has one."""
+
+
+@dataclass
+class CampaignResult:
+    """What a campaign gives back.
+
+    Attributes
+    ----------
+    system : str
+    seed, runs : int
+    statistics : dict of str to Statistics
+        By evaluation component.
+    verdicts : dict of str to Verdict
+    excluded : list of dict
+        Failed members, up to `MOST_NAMED`: ``member``, ``component``, ``t_s``, ``reason``.
+    n_excluded : int
+    parameters : dict of str to ndarray
+        Dispersed parameters as they reached the components, of the first `SHOWN` members.
+    kernel : str
+    wall_s, setup_s : float
+        Time of flying and merging; time to check and build before it.
+    workers : str
+        What flew it.
+    configuration : dict
+        Everything that was set.
+    out : Path or None
+    """
+
+    system: str
+    doc: str
+    seed: int
+    runs: int
+    duration: Fraction
+    configuration: dict[str, Any]
+    statistics: dict[str, Statistics]
+    workers: str
+    setup_s: float
+    wall_s: float = 0.0
+    kernel: str = ""
+    verdicts: dict[str, Verdict] = field(default_factory=dict)
+    excluded: list[dict[str, Any]] = field(default_factory=list)
+    n_excluded: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)
+    parameters: dict[str, Any] = field(default_factory=dict)
+    parameter_units: dict[str, str] = field(default_factory=dict)
+    graph: str = ""
+    out: Path | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """Plain types, for JSON."""
+        return summary_of(self)
+
+    def dataset(self) -> Any:
+        """Statistics as an `xarray.Dataset`."""
+        return build_result(self)
+
+    def _add(self, block: BlockResult) -> None:
+        for path, sums in block.sums.items():
+            self.statistics[path].add(sums)
+        self.n_excluded += len(block.excluded)
+        for each in block.excluded:
+            self.reasons[each["reason"]] = self.reasons.get(each["reason"], 0) + 1
+            if len(self.excluded) < MOST_NAMED:
+                self.excluded.append(each)
+        if block.number * BLOCK < SHOWN:
+            for name, values in block.parameters.items():
+                before = [self.parameters[name]] if name in self.parameters else []
+                self.parameters[name] = np.concatenate([*before, values])
+        kinds = {k for k in [*self.kernel.split("+"), *block.kernel.split("+")] if k}
+        self.kernel = "+".join(sorted(kinds))
+
+
+def run_campaign(
+    source: FileSource | System,
+    *,
+    runs: int,
+    seed: int | None = None,
+    duration: Exact | None = None,
+    workers: int | None = None,
+    dask: str | None = None,
+    out: str | Path | None = None,
+    resume: bool = False,
+    histories: bool = False,
+    batch: int | None = None,
+    progress: Progress | None = None,
+    started: Callable[[Any], None] | None = None,
+) -> CampaignResult:
+    """Fly a campaign.
+
+    Parameters
+    ----------
+    source : FileSource or System
+        A system needs components that can be pickled where several processes fly it.
+    runs : int
+        Members.
+    seed : int, optional
+        Root seed; the system's own if absent.
+    duration : exact time, optional
+        [s]; the system's own if absent.
+    workers : int, optional
+        Processes of this machine; one per processor if absent. A campaign of one batch is flown
+        in this process by as many threads.
+    dask : str, optional
+        Address of a Dask scheduler, or ``"local:2"``.
+    out : path, optional
+        Folder of the campaign.
+    resume : bool
+        Complete what is in `out`.
+    histories : bool
+        Keep full records of every member, in `out`.
+    batch : int, optional
+        Members flown together; chosen by memory if absent. Changes no bit of the result.
+    progress : callable, optional
+        ``progress(what, fraction)``.
+    started : callable, optional
+        Called with the Dask client once there is one.
+
+    Raises
+    ------
+    SystemCheckError, ConfigurationError, CheckpointError
+        Before anything runs.
+    CampaignError
+        If it ends early.
+    """
+    began = time.perf_counter()
+    _check_numbers(runs, workers, batch, resume=resume, out=out, histories=histories)
+    system = source.read() if isinstance(source, FileSource) else source
+    length = system.duration if duration is None else seconds(duration, "duration")
+    if length is None or length <= 0:
+        raise RateError(f"system '{system.name}' has no duration; give one, such as '600 s'")
+    root = system.seed if seed is None else seed
+    simulation = Simulation(
+        system, members=[0], seed=root, duration=length, runs=runs, recording=False
+    )
+    try:
+        found = layouts(simulation, length)
+        result = CampaignResult(
+            system=system.name,
+            doc=system.doc,
+            seed=root,
+            runs=runs,
+            duration=length,
+            configuration=configuration(simulation.plan),
+            statistics={path: Statistics(layout) for path, layout in found.items()},
+            workers="",
+            setup_s=0.0,
+            parameter_units={name: unit for name, (unit, _) in simulation.parameters.items()},
+        )
+        size = batch or members_per_batch(simulation, found)
+    finally:
+        simulation.master.terminate()
+    store = None
+    if out is not None:
+        result.out = Path(out)
+        store = Store(result.out, _identity(result, histories=histories), resume=resume)
+    try:
+        task = Task(
+            source, runs, root, length, str(Path(out) / "histories") if out and histories else None
+        )
+        result.setup_s = time.perf_counter() - began
+        _fly(result, task, store, size, workers, dask, progress, started)
+        result.verdicts = {path: judge(s) for path, s in result.statistics.items()}
+        result.wall_s = time.perf_counter() - began - result.setup_s
+        if progress is not None and store is not None:
+            progress("writing", 1.0)
+        if store is not None:
+            _write(result, system)
+        return result
+    finally:
+        if store is not None:
+            store.close()
+
+
+def _check_numbers(
+    runs: int,
+    workers: int | None,
+    batch: int | None,
+    *,
+    resume: bool,
+    out: object,
+    histories: bool,
+) -> None:
+    for name, value, most in (("runs", runs, MAX_MEMBER), ("workers", workers, 4096)):
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+            raise ConfigurationError(f"{name} is {value!r}; it is a whole number from 1 to {most}")
+    if batch is not None and (batch < 1 or batch % BLOCK):
+        raise ConfigurationError(f"batch is {batch!r}; it is a multiple of {BLOCK}")
+    if out is None and (resume or histories):
+        what = "resume a campaign" if resume else "keep histories"
+        raise ConfigurationError(f"to {what}, say where its folder is\n  give --out DIR")
+
+
+def _drawn(system: System) -> str:
+    """The system's diagram as SVG."""
+    from tempfile import TemporaryDirectory
+
+    from terrafix.cosim.graph import draw
+
+    with TemporaryDirectory(prefix="terrafix-") as folder:
+        file = Path(folder, "graph.svg")
+        draw(system, file)
+        text = file.read_text()
+    return text[text.index("<svg") :]
+
+
+def _identity(result: CampaignResult, *, histories: bool) -> dict[str, Any]:
+    from terrafix.cosim.results import versions
+
+    plain: dict[str, Any] = json.loads(
+        json.dumps(
+            {
+                "system": result.system,
+                "seed": result.seed,
+                "runs": result.runs,
+                "duration": f"{text_seconds(result.duration)} s",
+                "histories": histories,
+                "configuration": result.configuration,
+                "versions": versions(),
+            },
+            default=str,
+        )
+    )
+    return plain
+
+
+def _fly(
+    result: CampaignResult,
+    task: Task,
+    store: Store | None,
+    size: int,
+    workers: int | None,
+    dask: str | None,
+    progress: Progress | None,
+    started: Callable[[Any], None] | None,
+) -> None:
+    n_blocks = -(-result.runs // BLOCK)
+    done = store.done() & set(range(n_blocks)) if store is not None else set()
+    ready: dict[int, BlockResult | None] = dict.fromkeys(sorted(done))
+    merged = 0
+
+    def merge() -> None:
+        nonlocal merged
+        while merged in ready:
+            block = ready.pop(merged)
+            if block is None and store is not None:
+                block = store.read(merged)
+            if block is None:  # damaged: flown again below
+                return
+            result._add(block)
+            merged += 1
+            if progress is not None:
+                progress("flying", merged / n_blocks)
+
+    merge()
+    while merged < n_blocks:
+        missing = [b for b in range(merged, n_blocks) if b not in ready]
+        batches = _batches(missing, size, result.runs, workers, dask)
+        flown, result.workers = _flown(task, batches, workers, dask, started)
+        n_done = len(done)
+        try:
+            for blocks in flown:
+                for block in blocks:
+                    if store is not None:
+                        store.write(block)
+                    ready[block.number] = block
+                    n_done += 1
+                merge()
+        except KeyboardInterrupt as error:
+            raise CampaignError(_kept("interrupted", n_done, n_blocks, result)) from error
+        except TerrafixError as error:
+            if merged == 0 and not done and isinstance(error, ConfigurationError):
+                raise
+            raise CampaignError(_kept(str(error), n_done, n_blocks, result)) from error
+        finally:
+            flown.close()  # type: ignore[attr-defined]
+    if all(not s.n[-1] for s in result.statistics.values()):
+        last = result.excluded[-1] if result.excluded else {"reason": "nothing was evaluated"}
+        raise CampaignError(
+            f"no member is left of {result.runs}\n  the last failed: {last['reason']}"
+        )
+
+
+def _batches(
+    missing: list[int], size: int, runs: int, workers: int | None, dask: str | None
+) -> list[pools.Batch]:
+    """Consecutive blocks together, up to `size` members; enough batches that nobody is idle."""
+    n_workers = workers or pools.processors()
+    share = -(-len(missing) // n_workers) * BLOCK
+    largest = min(size, share) if dask is None and len(missing) * BLOCK > size else size
+    per_batch = max(1, largest // BLOCK)
+    batches: list[pools.Batch] = []
+    start = 0
+    while start < len(missing):
+        end = start + 1
+        while (
+            end < len(missing)
+            and end - start < per_batch
+            and missing[end] == missing[end - 1] + 1
+        ):
+            end += 1
+        batches.append((missing[start] * BLOCK, min((missing[end - 1] + 1) * BLOCK, runs)))
+        start = end
+    return batches
+
+
+def _flown(
+    task: Task,
+    batches: list[pools.Batch],
+    workers: int | None,
+    dask: str | None,
+    started: Callable[[Any], None] | None,
+) -> tuple[Iterable[list[BlockResult]], str]:
+    if dask is not None:
+        return pools.on_dask(task, batches, address=dask, started=started), f"Dask at {dask}"
+    count = workers or pools.processors()
+    if len(batches) == 1 or count == 1:
+        text = "this process" + (f", {count} threads" if count > 1 else "")
+        return pools.in_this_process(task, batches, threads=count), text
+    count = min(count, len(batches))
+    _refuse_unpicklable(task)
+    return pools.in_processes(task, batches, workers=count), f"{count} processes"
+
+
+def _refuse_unpicklable(task: Task) -> None:
+    import pickle
+
+    try:
+        pickle.dumps(task)
+    except Exception as error:
+        raise ConfigurationError(
+            f"this system cannot be sent to other processes: {error}\n"
+            "  give workers=1, or a FileSource, which each process reads for itself"
+        ) from error
+
+
+def _kept(what: str, done: int, total: int, result: CampaignResult) -> str:
+    if result.out is None:
+        return f"{what}\n  {done} of {total} blocks of {BLOCK} members were done; none is kept"
+    return (
+        f"{what}\n  {done} of {total} blocks of {BLOCK} members are done, and kept in "
+        f"'{result.out}'\n  complete them with --out {result.out} --resume"
+    )
+
+
+def _write(result: CampaignResult, system: System) -> None:
+    from terrafix.cosim.results import write_netcdf
+
+    assert result.out is not None
+    try:
+        result.graph = _drawn(system)
+        write_netcdf(result.dataset(), result.out / RESULT)
+        text = json.dumps(result.summary(), indent=1).encode()
+        write_atomically(result.out / SUMMARY, lambda f: f.write(text))
+    except ConfigurationError as error:
+        raise CampaignError(
+            f"the campaign is complete, but {error}\n"
+            f"  make room, and write it with --out {result.out} --resume"
+        ) from error

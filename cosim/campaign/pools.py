@@ -1,0 +1,168 @@
+"""Where batches are flown: this process, several of this machine, or the workers of a Dask cluster.
+
+Each hands back what a batch returned as soon as it is done, in any order. A worker that is lost
+costs its batch the time to be flown again, and nothing else.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any
+
+from terrafix.cosim.campaign.batch import BlockResult, Task, fly_batch, single_threaded
+from terrafix.cosim.errors import ConfigurationError, StepError
+
+Batch = tuple[int, int]
+"""First member, and the one after the last."""
+Flown = Iterator[list[BlockResult]]
+MOST_LOSSES = 3
+CONNECT_SECONDS = 10
+
+
+def processors() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def in_this_process(task: Task, batches: Sequence[Batch], *, threads: int) -> Flown:
+    """Fly one batch after the other; members are stepped in threads."""
+    before = os.environ.get("TERRAFIX_THREADS")
+    os.environ["TERRAFIX_THREADS"] = str(threads)
+    try:
+        for first, last in batches:
+            yield fly_batch(task, first, last)
+    finally:
+        if before is None:
+            del os.environ["TERRAFIX_THREADS"]
+        else:
+            os.environ["TERRAFIX_THREADS"] = before
+
+
+def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown:
+    """Fly batches in processes of their own."""
+    waiting = list(batches)[::-1]
+    lost: dict[Batch, int] = {}
+    while waiting:
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(workers, context, initializer=single_threaded)
+        running: dict[Any, Batch] = {}
+        try:
+            while waiting or running:
+                while waiting and len(running) < workers + 1:
+                    batch = waiting.pop()
+                    running[pool.submit(fly_batch, task, *batch)] = batch
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    yield future.result()
+                    del running[future]
+        except BrokenProcessPool:
+            again = list(running.values())
+            for batch in again:
+                _count_loss(lost, batch)
+            waiting += again[::-1]
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
+
+
+def _count_loss(lost: dict[Batch, int], batch: Batch) -> None:
+    lost[batch] = lost.get(batch, 0) + 1
+    if lost[batch] > MOST_LOSSES:
+        raise StepError(
+            f"the worker that flew members {batch[0]} to {batch[1] - 1} was lost "
+            f"{lost[batch]} times\n  it may need more memory than there is: give fewer --workers"
+        )
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Any]:
+    try:
+        from dask.distributed import Client, LocalCluster
+    except ImportError:
+        raise ConfigurationError(
+            "a campaign on Dask needs the package 'distributed'\n"
+            "  install it with `pip install terrafix[dask]`"
+        ) from None
+    if address.startswith("local:"):
+        count = address.removeprefix("local:")
+        if not count.isdigit() or int(count) < 1:
+            raise ConfigurationError(f"'{address}' names no number of workers; write local:2")
+        with (
+            LocalCluster(
+                n_workers=int(count),
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                silence_logs=50,
+            ) as cluster,
+            Client(cluster) as client,
+        ):
+            yield client
+        return
+    try:
+        client = Client(address, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(
+            f"there is no Dask scheduler at '{address}': {error}\n"
+            "  start one with `dask scheduler`, or write local:2 for workers of this machine"
+        ) from error
+    with client:
+        yield client
+
+
+def on_dask(
+    task: Task,
+    batches: Sequence[Batch],
+    *,
+    address: str,
+    started: Callable[[Any], None] | None = None,
+) -> Flown:
+    """Fly batches as tasks of a Dask cluster, a few more of them than it has workers.
+
+    `started` is called with the client once the cluster is there.
+    """
+    with _cluster(address) as client:
+        from dask.distributed import as_completed
+        from distributed.scheduler import KilledWorker
+
+        if started is not None:
+            started(client)
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        ahead = 2 * max(1, sum(w["nthreads"] for w in workers.values()))
+        waiting = list(batches)[::-1]
+        lost: dict[Batch, int] = {}
+        batch_of: dict[str, Batch] = {}
+        queue = as_completed()
+
+        def submit() -> None:
+            batch = waiting.pop()
+            future = client.submit(_on_worker, task, *batch, pure=False)
+            batch_of[future.key] = batch
+            queue.add(future)
+
+        while waiting and len(batch_of) < ahead:
+            submit()
+        for future in queue:
+            batch = batch_of.pop(future.key)
+            try:
+                results = future.result()
+            except KilledWorker:
+                _count_loss(lost, batch)
+                waiting.append(batch)
+            else:
+                yield results
+            future.release()
+            if waiting:
+                submit()
+
+
+def _on_worker(task: Task, first: int, last: int) -> list[BlockResult]:
+    single_threaded()
+    return fly_batch(task, first, last)
