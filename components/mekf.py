@@ -17,7 +17,7 @@ from terrafix.cosim.ports import BundleInput, BundleOutput, Input, MessageInput,
 from terrafix.cosim.symbolic import SymbolicComponent
 from terrafix.models.earth import EARTH
 from terrafix.models.gravity import GRAVITY_MODELS
-from terrafix.models.mekf import TRANSITIONS, mekf_correct_model, mekf_predict_model
+from terrafix.models.mekf import JACOBIANS, TRANSITIONS, mekf_correct_model, mekf_predict_model
 from terrafix.models.model import Model
 from terrafix.models.sar import IN_TRACK
 from terrafix.models.updates import UPDATES
@@ -64,6 +64,9 @@ class MekfCorrect(SymbolicComponent):
         "speed",
         doc="what the fix's fourth element is: the speed, or the velocity that focused an image",
     )
+    jacobian = Choice(
+        JACOBIANS, "exact", doc="wrong-sign: of the misalignment's part (negative control)"
+    )
     look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     underweighting = Parameter(0.2, minimum=0.0, doc="Lear's factor on H P H'")
@@ -85,4 +88,4 @@ class MekfCorrect(SymbolicComponent):
 
     def build_model(self) -> Model:
         """Build the model for the chosen update and measurement."""
-        return mekf_correct_model(self.update, self.in_track)
+        return mekf_correct_model(self.update, self.in_track, self.jacobian)

@@ -52,6 +52,9 @@ class SyntheticSarFix(SymbolicComponent):
     geolocation_bias = Parameter(
         0.0, shape=(3,), unit="m", doc="constant error of the geocoded pixel, not reported"
     )
+    error_scale = Parameter(
+        1.0, minimum=0.0, doc="size of the random errors relative to what the fix reports"
+    )
     radius = Parameter(EARTH.radius, unit="m", positive=True, doc="equatorial radius")
     flattening = Parameter(EARTH.flattening, minimum=0.0, maximum=0.1, doc="of the ellipsoid")
 

@@ -46,6 +46,9 @@ from terrafix.models.updates import Measurement, update_rule
 TRANSITIONS = ("exact", "printed")
 """Names of the transition matrices."""
 
+JACOBIANS = ("exact", "wrong-sign")
+"""Names of the derivatives of the measurement; the second is a negative control."""
+
 REASONS = (
     "accepted",
     "gate",
@@ -216,7 +219,9 @@ def _propagated(P: Any, phi: Any, accel_psd: Any, misalignment_psd: Any, dt: Any
     return mirrored(ca.blockcat([[state, moved[:, 6:]], [moved[:, 6:].T, mount]]))
 
 
-def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
+def mekf_correct_model(
+    update: str = "ekf", in_track: str = "speed", jacobian: str = "exact"
+) -> Model:
     r"""Correction of the prior by a fix: update, underweighting, gate.
 
     The reported position of the pixel has covariance D; it enters the innovation as
@@ -230,6 +235,8 @@ def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
         prior misalignment, an error of second order; the other two center it on the estimate.
     in_track : {"speed", "effective"}
         What the fix's fourth element is: see `terrafix.models.sar`.
+    jacobian : {"exact", "wrong-sign"}
+        Derivative of the measurement; with the misalignment's part reversed as a negative control.
 
     Returns
     -------
@@ -253,6 +260,8 @@ def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
     ValueError
         If a choice is not known.
     """
+    if jacobian not in JACOBIANS:
+        raise ValueError(f"jacobian must be one of {JACOBIANS}, got '{jacobian}'")
     rule = update_rule(update)
     prior = estimate_symbols("prior")
     shapes = {"y": (4, 1), "r_f_e": (3, 1), "R": (4, 4), "D": (3, 3), "present": (4, 1)}
@@ -275,7 +284,8 @@ def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
     beta = ca.if_else(n_updates <= underweighted_updates, underweighting, 0.0)
     arrived = fresh > 0.5
     fix["present"] = ca.if_else(arrived, fix["present"], 0.0)
-    outcome = rule(mirrored(prior["P"]), _measurement(prior, fix, q_be, q_sb, in_track), beta)
+    measurement = _measurement(prior, fix, q_be, q_sb, in_track, jacobian)
+    outcome = rule(mirrored(prior["P"]), measurement, beta)
     dof = ca.sum1(fix["present"] > 0.5)
     threshold = sum(ca.if_else(dof == k + 1, gate[k], 0.0) for k in range(4))
     reason = ca.if_else(
@@ -300,7 +310,7 @@ def mekf_correct_model(update: str = "ekf", in_track: str = "speed") -> Model:
     }
     posterior = {k: ca.if_else(accepted, corrected[k], prior[k]) for k in prior}
     return Model(
-        f"mekf_correct_{update}_{in_track}",
+        f"mekf_correct_{update}_{in_track}" + ("" if jacobian == "exact" else "_wrong"),
         inputs=inputs,
         states={"n_updates": n_updates},
         parameters={**parameters, "gate": gate},
@@ -336,7 +346,9 @@ def _recentered(P: Any, dmu: Any) -> Any:
     return mirrored(ca.mtimes(J, ca.mtimes(P, J.T)))
 
 
-def _measurement(prior: Any, fix: Any, q_be: Any, q_sb: Any, in_track: str) -> Measurement:
+def _measurement(
+    prior: Any, fix: Any, q_be: Any, q_sb: Any, in_track: str, jacobian: str
+) -> Measurement:
     """Express the fix as a measurement of the error of the prior."""
     error, pixel = ca.SX.sym("error", 9), ca.SX.sym("pixel", 3)
     y = predicted_measurement(
@@ -350,6 +362,8 @@ def _measurement(prior: Any, fix: Any, q_be: Any, q_sb: Any, in_track: str) -> M
         in_track,
     )
     by_error, by_pixel = ca.jacobian(y, error), ca.jacobian(y, pixel)
+    if jacobian == "wrong-sign":
+        by_error = ca.horzcat(by_error[:, :6], -by_error[:, 6:])
 
     def at(expression: Any) -> Any:
         return lambda e: ca.substitute(

@@ -222,7 +222,8 @@ def synthetic_fix_model(boresight: str = "true", in_track: str = "speed") -> Mod
     Model
         Inputs ``r_e`` [m], ``v_e`` [m/s], (3,), ``q_be``, ``q_mu``, (4,). Parameters ``look``,
         ``squint`` [rad], ``range_sigma`` [m], ``speed_sigma`` [m/s], ``geolocation_sigma`` and
-        ``geolocation_bias`` (3,) Earth-fixed [m], ``radius`` [m], ``flattening``. Outputs
+        ``geolocation_bias`` (3,) Earth-fixed [m], ``error_scale``, the size of the random errors
+        relative to the reported one, ``radius`` [m], ``flattening``. Outputs
         ``fix.y`` (4,), ``fix.r_f_e`` (3,) [m], ``fix.R`` (4, 4), ``fix.D`` (3, 3),
         ``fix.present`` (4,) ones, and ``fix.valid``, 1 where the boresight meets the ellipsoid.
 
@@ -235,9 +236,9 @@ def synthetic_fix_model(boresight: str = "true", in_track: str = "speed") -> Mod
         raise ValueError(f"boresight must be one of {BORESIGHTS}, got '{boresight}'")
     r_e, v_e = ca.SX.sym("r_e", 3), ca.SX.sym("v_e", 3)
     q_be, q_mu = ca.SX.sym("q_be", 4), ca.SX.sym("q_mu", 4)
-    scalars = ("look", "squint", "range_sigma", "speed_sigma", "radius", "flattening")
-    parameters = {name: ca.SX.sym(name) for name in scalars}
-    look, squint, range_sigma, speed_sigma, radius, flattening = parameters.values()
+    scalars = ("look", "squint", "range_sigma", "speed_sigma", "error_scale")
+    parameters = {name: ca.SX.sym(name) for name in (*scalars, "radius", "flattening")}
+    look, squint, range_sigma, speed_sigma, scale, radius, flattening = parameters.values()
     sigma, bias = ca.SX.sym("geolocation_sigma", 3), ca.SX.sym("geolocation_bias", 3)
     range_noise, speed_noise = ca.SX.sym("range_noise"), ca.SX.sym("speed_noise")
     noise = ca.SX.sym("geolocation_noise", 3)
@@ -248,8 +249,8 @@ def synthetic_fix_model(boresight: str = "true", in_track: str = "speed") -> Mod
     y = ca.vertcat(
         0,
         0,
-        ca.sqrt(ca.dot(line, line)) + range_sigma * range_noise,
-        in_track_velocity(r_e, v_e, r_f_e, in_track) + speed_sigma * speed_noise,
+        ca.sqrt(ca.dot(line, line)) + scale * range_sigma * range_noise,
+        in_track_velocity(r_e, v_e, r_f_e, in_track) + scale * speed_sigma * speed_noise,
     )
     return Model(
         "synthetic_fix",
@@ -262,7 +263,7 @@ def synthetic_fix_model(boresight: str = "true", in_track: str = "speed") -> Mod
         },
         outputs={
             "fix.y": y,
-            "fix.r_f_e": r_f_e + sigma * noise + bias,
+            "fix.r_f_e": r_f_e + scale * sigma * noise + bias,
             "fix.R": ca.diag(ca.vertcat(0, 0, range_sigma**2, speed_sigma**2)),
             "fix.D": ca.diag(sigma**2),
             "fix.present": ca.SX.ones(4),
