@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from terrafix.components.fields import ESTIMATE, INNOVATION, XYZ
@@ -12,7 +13,13 @@ from terrafix.cosim.clock import Rate
 from terrafix.cosim.evaluation import Evaluation, FloatArray, History, Quantity, consistency
 from terrafix.cosim.ports import BundleInput, Input, MessageInput, Output
 from terrafix.models.consistency import normalized_square
-from terrafix.models.mekf import REASONS, navigation_error_array
+from terrafix.models.mekf import (
+    ESTIMATE_FIELDS,
+    REASONS,
+    navigation_error,
+    navigation_error_array,
+)
+from terrafix.models.model import Model
 
 
 class NavigationEvaluation(Evaluation):
@@ -75,6 +82,17 @@ class NavigationEvaluation(Evaluation):
         self.nis_dof = np.where(fresh, self.innovation.dof, np.nan)
         self.accepted = np.where(fresh, self.innovation.accepted, np.nan)
         self.reason = np.where(fresh, self.innovation.reason, np.nan)
+
+    def error_model(self) -> Model:
+        """Errors of all quantities as a function of what the ports bring, for linearization."""
+        inputs = {"r_e": (3, 1), "v_e": (3, 1), "q_mu": (4, 1)}
+        inputs |= {f"estimate.{name}": ESTIMATE_FIELDS[name] for name in ("r_e", "v_e", "q_mu")}
+        symbols = {name: ca.SX.sym(name.replace(".", "_"), *s) for name, s in inputs.items()}
+        return Model(
+            "navigation_error",
+            inputs=symbols,
+            outputs={"error": navigation_error(*symbols.values())},
+        )
 
     def summarize(self, times: FloatArray, history: History) -> dict[str, Any]:
         """Summarize errors at the end, NEES and NIS over all fixes, and the fixes one by one."""

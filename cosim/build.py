@@ -67,6 +67,7 @@ def bind_components(
     members: NDArray[np.int64],
     active: NDArray[np.bool_],
     fail: Callable[[str, NDArray[np.bool_], str], None],
+    quiet: bool = False,
 ) -> None:
     """Lend every component its environment and arrays."""
     for path, component in plan.flat.components.items():
@@ -74,7 +75,7 @@ def bind_components(
         def report(mask: NDArray[np.bool_], reason: str, path: str = path) -> None:
             fail(path, mask, reason)
 
-        component.bind(Environment(path, seed, members, active, report))
+        component.bind(Environment(path, seed, members, active, report, quiet))
 
 
 def connect_ports(plan: Plan, n_members: int, active: NDArray[np.bool_]) -> Wiring:

@@ -65,6 +65,8 @@ class Environment:
         Members that have not failed.
     fail : callable
         ``fail(mask, reason)`` excludes members from here on.
+    quiet : bool
+        Every draw of noise is zero: the nominal run, about which errors are linearized.
     """
 
     path: str
@@ -72,6 +74,7 @@ class Environment:
     members: NDArray[np.int64]
     active: Mask
     fail: Callable[[Mask, str], None]
+    quiet: bool = False
 
     @property
     def n_members(self) -> int:
@@ -294,6 +297,8 @@ class Component:
         the number of this component's step, and on nothing else: asked twice in a step, a stream
         gives the same numbers twice.
         """
+        if self.environment.quiet:
+            return np.zeros((self.n_members, n))
         source = self._streams.get((stream, n))
         if source is None:
             if n < 1:

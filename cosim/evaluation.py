@@ -95,6 +95,13 @@ class Evaluation(Component):
 
     quantities: ClassVar[tuple[Quantity, ...]] = ()
 
+    def error_model(self) -> Any:
+        """Errors of all quantities, in one output ``error``, as a function of the inputs' fields.
+
+        Needed to predict a campaign by linear covariance analysis.
+        """
+        raise NotImplementedError
+
     def recorded_ports(self) -> list[str]:
         """Output ports whose history `summarize` needs."""
         return [n for n, p in self.outputs().items() if p.kind != "shared"]

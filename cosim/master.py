@@ -100,6 +100,8 @@ class Master:
         Numbers of the members to fly.
     runs : int, optional
         How many members there are in all, where these are a part.
+    quiet : bool
+        Draw no noise and apply no dispersion.
 
     Attributes
     ----------
@@ -112,7 +114,13 @@ class Master:
     """
 
     def __init__(
-        self, plan: Plan, *, seed: int, members: NDArray[np.int64], runs: int | None = None
+        self,
+        plan: Plan,
+        *,
+        seed: int,
+        members: NDArray[np.int64],
+        runs: int | None = None,
+        quiet: bool = False,
     ) -> None:
         self.plan = plan
         self.seed = seed
@@ -122,11 +130,13 @@ class Master:
         self.tick = 0
         self.component_steps = 0
         self._numerator, self._denominator = plan.base.numerator, plan.base.denominator
-        bind_components(plan, seed=seed, members=members, active=self.active, fail=self._exclude)
+        bind_components(
+            plan, seed=seed, members=members, active=self.active, fail=self._exclude, quiet=quiet
+        )
         self._lent = {p: c.environment for p, c in plan.flat.components.items()}
         self._terminated = False
         self.draws = apply_all(
-            plan.flat.dispersions,
+            () if quiet else plan.flat.dispersions,
             plan.flat.components,
             seed=seed,
             members=members,

@@ -104,6 +104,8 @@ class Simulation:
         out over all.
     recording : bool
         Whether the system's records are taken; what evaluations publish always is.
+    quiet : bool
+        Fly the nominal run: no noise is drawn, no dispersion applied.
     folder : Path, optional
         Where records are kept while the run goes on.
 
@@ -127,6 +129,7 @@ class Simulation:
         duration: Exact | None = None,
         runs: int | None = None,
         recording: bool = True,
+        quiet: bool = False,
         folder: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
@@ -142,7 +145,9 @@ class Simulation:
         self.folder = folder
         self.checkpoint: Path | None = None
         try:
-            self.master = Master(self.plan, seed=self.seed, members=self.members, runs=runs)
+            self.master = Master(
+                self.plan, seed=self.seed, members=self.members, runs=runs, quiet=quiet
+            )
             self.kernel = self._build_kernels(progress)
             self.recorders = self._make_recorders(recording=recording)
         except BaseException:

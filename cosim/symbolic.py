@@ -120,12 +120,12 @@ class SymbolicComponent(Component):
     @property
     def kept_kernel(self) -> Kernel | None:
         """The kernel of an earlier simulation of this component, if it would be made alike now."""
-        now = (id(self.model), _asked_for())
+        now = (id(self.model), self.environment.quiet, _asked_for())
         return self._kept[1] if self._kept is not None and self._kept[0] == now else None
 
     def keep_kernel(self, kernel: Kernel) -> None:
         """Keep a kernel for later simulations."""
-        self._kept = ((id(self.model), _asked_for()), kernel)
+        self._kept = ((id(self.model), self.environment.quiet, _asked_for()), kernel)
 
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: neither models nor kernels, which are made there."""
@@ -187,7 +187,8 @@ class SymbolicComponent(Component):
         arguments = [Argument(n, size(n), "array") for n in model.inputs]
         arguments += [Argument(f"state:{n}", size(n), "array") for n in model.states]
         arguments += [Argument(n, size(n), "constant") for n in model.parameters]
-        arguments += [Argument(n, size(n), "noise") for n in model.noise]
+        kind = "constant" if self._environment is not None and self._environment.quiet else "noise"
+        arguments += [Argument(n, size(n), kind) for n in model.noise]
         if model.step is not None:
             arguments.append(Argument("step", 1, "step"))
         if model.time is not None:
@@ -215,10 +216,7 @@ class SymbolicComponent(Component):
         """Tie the kernel to this component's arrays, once ports are bound."""
         env = self.environment
         model = self.model
-        arrays = {n: self._input_array(n) for n in model.inputs}
-        arrays |= {f"state:{n}": self._states[n] for n in model.states}
-        arrays |= {n: self._settings[n] for n in model.parameters}
-        arrays |= {"step": self._dt, "time": self._t}
+        arrays = self.arguments()
         results = {n: self._output_array(n) for n in model.outputs}
         results |= {f"state:{n}": self._states[n] for n in model.states}
         keys = {n: stream_key(env.seed, env.path, n) for n in model.noise}
@@ -232,6 +230,17 @@ class SymbolicComponent(Component):
             active=env.active,
             failed=self._failed,
         )
+
+    def arguments(self) -> dict[str, FloatArray]:
+        """The arrays that a step reads, by the names of `kernel_request`."""
+        model = self.model
+        arrays = {n: self._input_array(n) for n in model.inputs}
+        arrays |= {f"state:{n}": self._states[n] for n in model.states}
+        arrays |= {n: self._settings[n] for n in model.parameters}
+        if self.environment.quiet:
+            n_members = self.n_members
+            arrays |= {n: np.zeros((n_members, *model.shape(n))) for n in model.noise}
+        return arrays | {"step": self._dt, "time": self._t}
 
     def _input_array(self, name: str) -> FloatArray:
         head, _, tail = name.partition(".")

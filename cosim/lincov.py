@@ -1,0 +1,724 @@
+r"""Linear covariance analysis: a campaign predicted from one nominal run and symbolic Jacobians.
+
+The system is flown once without noise. About that run, deviations of everything that components
+keep or publish (truth and filter alike, stacked into :math:`z`) are linear in what is drawn:
+
+.. math::
+    z_{k+1} = F_k z_k + \sum_s G_{s,k} w_{s,k}, \qquad
+    C_{s,k+1} = F_k C_{s,k} F_k^T + G_{s,k} G_{s,k}^T,
+
+with one covariance :math:`C_s` per source :math:`s` (a stream of noise, its draw at the start, a
+dispersion). :math:`F` and :math:`G` are put together tick by tick from the Jacobians of the
+components' steps, in the order in which they step, through the connections. The error of the
+estimate is one more linear function of :math:`z`, so its covariance is that of a campaign's
+sample whether or not the filter's model is the truth's; what the filter itself predicts is its
+covariance in the nominal run.
+
+Matrices (an estimate's covariance, a fix's) are not deviated: gains are those of the nominal run.
+A deviation of a gain acts on the nominal innovation, which is zero where the filter's model of
+the mean is the truth's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.cosim.clock import Exact, seconds
+from terrafix.cosim.dispersion import Dispersion
+from terrafix.cosim.errors import ConfigurationError
+from terrafix.cosim.evaluation import Evaluation
+from terrafix.cosim.kernel_base import BoundKernel
+from terrafix.cosim.simulation import Simulation
+from terrafix.cosim.symbolic import SymbolicComponent
+from terrafix.cosim.system import System
+from terrafix.cosim.wiring import port_factor
+
+FloatArray = NDArray[np.float64]
+Key = tuple[str, str, str]
+"""(kind, component, name): kind ``"state"``, ``"slot"``, ``"held"`` or ``"parameter"``."""
+AT_ONCE = 1024
+"""Ticks whose Jacobians are evaluated together."""
+UNOBSERVED = 0.5
+"""Part of a variance that fixes leave, above which its direction counts as not observed."""
+
+
+class Direction(NamedTuple):
+    """A direction of the error: what part of its variance without fixes remains with them.
+
+    `components` are in sigma without fixes, by axis, of unit length.
+    """
+
+    remaining: float
+    components: FloatArray
+
+
+@dataclass
+class LinearCovariance:
+    """What is predicted of a campaign.
+
+    Attributes
+    ----------
+    path : str
+        Of the evaluation component.
+    labels, units : list of str
+        Of each axis.
+    times : ndarray, shape (n_epochs,)
+        [s]
+    filter : ndarray, shape (n_epochs, n_axes, n_axes)
+        Covariance that the filter predicts.
+    sources : dict of str to ndarray, shape (n_epochs, n_axes, n_axes)
+        Covariance of the error by source: the error budget.
+    directions : list of Direction
+        Directions of the error at the end by what the fixes leave of them, the largest first;
+        empty where the evaluation publishes no covariance.
+    """
+
+    path: str
+    labels: list[str]
+    units: list[str]
+    times: FloatArray
+    filter: FloatArray
+    sources: dict[str, FloatArray] = field(default_factory=dict)
+    directions: list[Direction] = field(default_factory=list)
+
+    @property
+    def total(self) -> FloatArray:
+        """Covariance of the error, (n_epochs, n_axes, n_axes)."""
+        return sum(self.sources.values(), np.zeros_like(self.filter))
+
+    @property
+    def sigma_filter(self) -> FloatArray:
+        """Sigma that the filter predicts, (n_epochs, n_axes)."""
+        return np.sqrt(np.diagonal(self.filter, axis1=1, axis2=2))
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Sigma that a campaign's sample will show, (n_epochs, n_axes)."""
+        return np.sqrt(np.diagonal(self.total, axis1=1, axis2=2))
+
+    def budget(self) -> dict[str, FloatArray]:
+        """Sigma at the end due to each source alone, (n_axes,), the largest contribution first."""
+        total = np.diagonal(self.total[-1])
+        found = {name: np.sqrt(np.diagonal(c[-1])) for name, c in self.sources.items()}
+        return dict(sorted(found.items(), key=lambda item: -float((item[1] ** 2 / total).max())))
+
+    def unobserved(self) -> list[Direction]:
+        """Directions of which the fixes leave more than `UNOBSERVED`."""
+        return [d for d in self.directions if d.remaining > UNOBSERVED]
+
+
+def linear_covariance(system: System, *, duration: Exact | None = None) -> LinearCovariance:
+    """Predict a campaign of a system.
+
+    Parameters
+    ----------
+    system : System
+        Of symbolic components, and one evaluation that offers an `error_model`.
+    duration : exact time, optional
+        [s]; the system's own if absent.
+
+    Raises
+    ------
+    ConfigurationError
+        If a component cannot be linearized; it is named.
+    """
+    length = system.duration if duration is None else seconds(duration, "duration")
+    if length is None:
+        raise ConfigurationError(f"system '{system.name}' has no duration; give one")
+    simulation = Simulation(system, members=1, duration=length, recording=False, quiet=True)
+    try:
+        analysis = _Analysis(simulation)
+        analysis.fly(simulation.master.ticks(length))
+        result = analysis.result()
+    finally:
+        simulation.master.terminate()
+    result.directions = _directions(system, length, result)
+    return result
+
+
+class _Call(NamedTuple):
+    """One step of one component in the nominal run."""
+
+    path: str
+    arguments: list[FloatArray]
+    valid: dict[str, bool]
+
+
+class _Listening(BoundKernel):
+    """A kernel that notes what it is called with."""
+
+    def __init__(self, component: _Linear, kernel: BoundKernel) -> None:
+        self._component = component
+        self._kernel = kernel
+
+    def __call__(self, step: int) -> int:
+        component = self._component
+        arguments = [a.reshape(-1).copy() for a in component.needed]
+        failed = self._kernel(step)
+        messages = component.component._messages
+        valid = {name: bool(flag[0] > 0.5) for name, flag in messages.items()}
+        component.calls.append(_Call(component.path, arguments, valid))
+        return failed
+
+
+class _Linear:
+    """A symbolic component, and the Jacobian of its step by what deviates."""
+
+    def __init__(self, path: str, component: SymbolicComponent, analysis: _Analysis) -> None:
+        import casadi as ca
+
+        self.path = path
+        self.component = component
+        self.calls: list[_Call] = []
+        model = component.model
+        vectors = [n for n in model.states if len(model.shape(n)) == 1]
+        self.states = {n: int(np.prod(model.shape(n))) for n in vectors}
+        self.inputs = {}
+        for n in model.inputs:
+            if n.endswith((".fresh", ".t")) or len(model.shape(n)) > 1:
+                continue
+            source = analysis.source(path, n)
+            if source is not None:
+                self.inputs[n] = source
+        self.parameters = [
+            n for n in model.parameters if ("parameter", path, n) in analysis.dispersed
+        ]
+        wanted = analysis.read.get(path, set())
+        self.outputs = [n for n in model.outputs if n in wanted and len(model.shape(n)) == 1]
+        self.noise = {n: int(np.prod(model.shape(n))) for n in model.noise}
+        self.step_jacobian, self.step_arguments = self._jacobian(ca, start=False)
+        self.start_jacobian, _ = self._jacobian(ca, start=True)
+        arrays = component.arguments()
+        self.needed = [arrays[n] for n in self.step_arguments]
+
+    def columns(self, *, start: bool) -> list[tuple[str, str]]:
+        """What the Jacobian is taken by: (kind, name), in order."""
+        kinds = [] if start else [("state", n) for n in self.states]
+        kinds += [("input", n) for n in self.inputs] + [("parameter", n) for n in self.parameters]
+        return kinds + [("noise", n) for n in self.noise]
+
+    def _jacobian(self, ca: Any, *, start: bool) -> tuple[Any, list[str]]:
+        """Function of the arguments that matter to the Jacobian, and their names."""
+        model = self.component.model
+        function = model.initial_function() if start else model.step_function()
+        states = [] if start else [f"state:{n}" for n in model.states]
+        names = [*model.inputs, *states, *model.parameters, *model.noise]
+        names += ["step"] * (model.step is not None) + ["time"] * (model.time is not None)
+        symbols = {
+            n: ca.SX.sym(f"a{i}", function.numel_in(i)) for i, n in enumerate(names)
+        }
+        results = function.call(list(symbols.values()))
+        result_of = dict(zip([*model.outputs, *(f"state:{n}" for n in model.states)], results, strict=True))
+        rows = [result_of[n] for n in self.outputs] + [result_of[f"state:{n}"] for n in self.states]
+        prefix = {"state": "state:", "input": "", "parameter": "", "noise": ""}
+        by = [symbols[prefix[kind] + n] for kind, n in self.columns(start=start)]
+        if not rows or not by:
+            return None, []
+        jacobian = ca.densify(ca.jacobian(ca.vertcat(*rows), ca.vertcat(*by)))
+        free = {e.element_hash() for e in ca.symvar(jacobian)}
+        needed = [
+            n for n in names if any(e.element_hash() in free for e in symbols[n].elements())
+        ]
+        made = ca.Function(
+            "jacobian", [symbols[n] for n in needed], [jacobian], {"cse": True}
+        )
+        return made, needed
+
+    def evaluate(self, calls: list[_Call]) -> FloatArray:
+        """Jacobians of some steps, (n, rows, columns)."""
+        return _evaluated(self.step_jacobian, [c.arguments for c in calls])
+
+
+def _evaluated(function: Any, arguments: list[list[FloatArray]]) -> FloatArray:
+    n = len(arguments)
+    rows, columns = function.size_out(0)
+    given = [np.stack(a, axis=1) for a in zip(*arguments, strict=True)]
+    if not given:
+        return np.broadcast_to(np.asarray(function()["o0"]), (n, rows, columns))
+    flat = np.asarray(function.map(n)(*given))
+    return flat.reshape(rows, n, columns).transpose(1, 0, 2)
+
+
+class _Analysis:
+    """Deviations of one system, and how they move."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        flat = simulation.plan.flat
+        self.order = simulation.plan.order
+        evaluations = {p: c for p, c in flat.components.items() if isinstance(c, Evaluation)}
+        if len(evaluations) != 1:
+            raise ConfigurationError(
+                f"linear covariance analysis needs one evaluation component, and system "
+                f"'{simulation.system.name}' has {len(evaluations)}"
+            )
+        ((self.evaluation_path, self.evaluation),) = evaluations.items()
+        try:
+            self.error_model = self.evaluation.error_model()
+        except NotImplementedError:
+            raise ConfigurationError(
+                f"'{self.evaluation_path}' ({type(self.evaluation).__name__}) offers no "
+                "error_model, which linear covariance analysis needs"
+            ) from None
+        for path, component in flat.components.items():
+            if component is not self.evaluation and not isinstance(component, SymbolicComponent):
+                raise ConfigurationError(
+                    f"'{path}' ({type(component).__name__}) has no symbolic Jacobian, so the "
+                    "system cannot be linearized\n  fly a campaign instead"
+                )
+        self.connections = {c.target: c for c in flat.connections}
+        self.dispersed: dict[Key, Dispersion] = {}
+        for d in flat.dispersions:
+            for target in d.targets:
+                owner, _, name = target.rpartition(".")
+                self.dispersed["parameter", owner, name] = d
+        self._find_read()
+        self.linear = {
+            path: _Linear(path, c, self)
+            for path, c in flat.components.items()
+            if isinstance(c, SymbolicComponent)
+        }
+        for linear in self.linear.values():
+            linear.component._call = _Listening(linear, linear.component._call)
+        self.log: list[_Call] = []
+        self._lay_out()
+        self.errors: list[tuple[float, dict[str, FloatArray]]] = []
+
+    # ------------------------------------------------------------------ who reads what
+
+    def source(self, path: str, name: str) -> tuple[Key, FloatArray | None] | None:
+        """Where an input comes from, and its unit conversion; None if it does not deviate."""
+        head, _, tail = name.partition(".")
+        connection = self.connections.get(f"{path}.{head}")
+        if connection is None:
+            return None
+        flat = self.simulation.plan.flat
+        owner, _, port_name = connection.source.rpartition(".")
+        port = flat.components[path].ports[head]
+        if connection.delay or port.window or port.queue > 1:
+            what = "a delay" if connection.delay else "a window or queue"
+            raise ConfigurationError(
+                f"the connection to '{path}.{head}' has {what}, which is not linearized\n"
+                "  fly a campaign instead"
+            )
+        factor = port_factor(flat.components[owner].ports[port_name], port)
+        if factor is not None:
+            factor = self._part(port, tail, factor)
+        full = f"{port_name}.{tail}" if tail else port_name
+        key: Key = ("held", path, name) if port.at == "start" else ("slot", owner, full)
+        return key, factor
+
+    @staticmethod
+    def _part(port: Any, tail: str, factor: FloatArray) -> FloatArray | None:
+        start = 0
+        for name, each in port.fields.items():
+            part = factor[start : start + each.size]
+            if name == tail:
+                return part
+            start += each.size
+        return None
+
+    def slot_of(self, path: str, name: str) -> Key:
+        """The slot behind an input, whenever it is read."""
+        head, _, tail = name.partition(".")
+        owner, _, port_name = self.connections[f"{path}.{head}"].source.rpartition(".")
+        return "slot", owner, f"{port_name}.{tail}" if tail else port_name
+
+    def _find_read(self) -> None:
+        self.read: dict[str, set[str]] = {}
+        flat = self.simulation.plan.flat
+        readers = [
+            (p, list(c.model.inputs))
+            for p, c in flat.components.items()
+            if isinstance(c, SymbolicComponent)
+        ]
+        readers.append((self.evaluation_path, list(self.error_model.inputs)))
+        for path, names in readers:
+            for name in names:
+                if f"{path}.{name.partition('.')[0]}" in self.connections:
+                    _, owner, full = self.slot_of(path, name)
+                    self.read.setdefault(owner, set()).add(full)
+
+    def _lay_out(self) -> None:
+        """Give everything that deviates a place in z, and every source a number."""
+        self.place: dict[Key, slice] = {}
+        self.held: dict[Key, Key] = {}
+        size = 0
+
+        def room(key: Key, n: int) -> None:
+            nonlocal size
+            if key not in self.place:
+                self.place[key] = slice(size, size + n)
+                size += n
+
+        self.sources: list[str] = []
+        for path, linear in self.linear.items():
+            model = linear.component.model
+            for name, n in linear.states.items():
+                room(("state", path, name), n)
+            for name in linear.outputs:
+                room(("slot", path, name), int(np.prod(model.shape(name))))
+            for name, (key, _) in linear.inputs.items():
+                if key[0] == "held":
+                    room(key, int(np.prod(model.shape(name))))
+                    self.held[key] = self.slot_of(path, name)
+            for name in linear.noise:
+                self.sources += [f"{path}.{name} at the start", f"{path}.{name}"]
+        names = list(dict.fromkeys(d.name for d in self.dispersed.values()))
+        self.sources += [f"dispersion {name}" for name in names]
+        number = {name: i for i, name in enumerate(self.sources)}
+        components = self.simulation.plan.flat.components
+        starts = []
+        for key, d in self.dispersed.items():
+            linear = self.linear[key[1]]
+            room(key, int(np.prod(linear.component.model.shape(key[2]))))
+            starts.append((number[f"dispersion {d.name}"], key, d))
+        self.size = size
+        self.C = np.zeros((len(self.sources), size, size))
+        for i, key, d in starts:
+            # targets of one dispersion take the same draw
+            for other_i, other, _ in starts:
+                if other_i == i:
+                    nominal = components[key[1]]._settings[key[2]][0]
+                    self.C[i, self.place[key], self.place[other]] = _dispersed_covariance(
+                        d, components, nominal
+                    )
+
+    # ------------------------------------------------------------------ moving
+
+    def fly(self, end: int) -> None:
+        """Fly the nominal run and move the covariances along with it."""
+        master = self.simulation.master
+        rates = {p: c.rate for p, c in self.simulation.plan.flat.components.items()}
+        self._order_of = {path: i for i, path in enumerate(self.order)}
+        self.simulation.initialize()
+        self._start()
+        if rates[self.evaluation_path].starts_at_zero:  # type: ignore[union-attr]
+            self._evaluate(0.0)
+        while master.tick < end:
+            # one tick at a time would cost a call each; the log says what happened at which
+            stop = min(end, master.tick + AT_ONCE)
+            self._watch(stop)
+        return
+
+    def _watch(self, stop: int) -> None:
+        master = self.simulation.master
+        ticks: list[tuple[int, list[_Call]]] = []
+        while master.tick < stop:
+            later = [g.next_tick for g in master._groups if g.next_tick is not None]
+            tick = min([*later, stop])
+            before = {p: len(x.calls) for p, x in self.linear.items()}
+            master.run_until(tick)
+            calls = [x.calls[-1] for p, x in self.linear.items() if len(x.calls) > before[p]]
+            calls.sort(key=lambda c: self._order_of[c.path])
+            ticks.append((tick, calls))
+            if tick in self._evaluation_ticks(stop):
+                self._move(ticks)
+                ticks = []
+                self._evaluate(master.seconds(tick))
+        self._move(ticks)
+        for linear in self.linear.values():
+            linear.calls.clear()
+
+    def _evaluation_ticks(self, stop: int) -> set[int]:
+        known: dict[int, set[int]] = self.__dict__.setdefault("_known_ticks", {})
+        if stop not in known:
+            plan = self.simulation.plan
+            rate = self.evaluation.rate
+            assert rate is not None
+            found = set()
+            for tick in rate.ticks(plan.base, plan.grid, after=max(known, default=0)):
+                if tick > stop:
+                    break
+                found.add(tick)
+            known[stop] = found
+        return known[stop]
+
+    def _start(self) -> None:
+        """Deviations at t = 0."""
+        for path in self.order:
+            linear = self.linear.get(path)
+            if linear is None or linear.start_jacobian is None:
+                continue
+            arrays = linear.component.arguments()
+            arrays |= {n: np.zeros((1, size)) for n, size in linear.noise.items()}
+            arrays |= {"step": np.zeros(1), "time": np.zeros(1)}
+            _, needed = linear._jacobian(__import__("casadi"), start=True)
+            J = _evaluated(linear.start_jacobian, [[arrays[n].reshape(-1) for n in needed]])[0]
+            F, G = np.eye(self.size), {}
+            rows = self._rows(linear, dict.fromkeys(linear.component._messages, True))
+            column = 0
+            for row in rows.values():
+                F[row] = 0.0
+            for kind, name in linear.columns(start=True):
+                n, place, factor = self._column(linear, kind, name)
+                for key, row in rows.items():
+                    block = J[self._row_of(linear, key), column : column + n]
+                    if kind == "noise":
+                        G.setdefault(name, np.zeros((self.size, n)))[row] = block
+                    elif place is not None:
+                        F[row, place] += block if factor is None else block * factor
+                column += n
+            self.C = F @ self.C @ F.T
+            for name, g in G.items():
+                self.C[self.sources.index(f"{path}.{name} at the start")] += g @ g.T
+        self._hold(list(self.linear))
+
+    def _hold(self, paths: list[str]) -> None:
+        """Latch what is read at the start of the next step."""
+        F = np.eye(self.size)
+        changed = False
+        for key, slot in self.held.items():
+            if key[1] in paths and slot in self.place:
+                F[self.place[key]] = 0.0
+                _, factor = self.linear[key[1]].inputs[key[2]]
+                block = np.eye(self.place[slot].stop - self.place[slot].start)
+                F[self.place[key], self.place[slot]] = block if factor is None else block * factor
+                changed = True
+        if changed:
+            self.C = F @ self.C @ F.T
+
+    def _column(
+        self, linear: _Linear, kind: str, name: str
+    ) -> tuple[int, slice | None, FloatArray | None]:
+        """Width of a column group, where it is in z, and its unit conversion."""
+        size = int(np.prod(linear.component.model.shape(name)))
+        if kind == "noise":
+            return size, None, None
+        if kind == "input":
+            key, factor = linear.inputs[name]
+            return size, self.place.get(key), factor
+        return size, self.place[(kind, linear.path, name)], None
+
+    def _rows(self, linear: _Linear, valid: Mapping[str, bool]) -> dict[Key, slice]:
+        """What a step changes in z: states, and outputs that were published."""
+        keys: list[Key] = [
+            ("slot", linear.path, n)
+            for n in linear.outputs
+            if valid.get(n.partition(".")[0], True)
+        ]
+        keys += [("state", linear.path, n) for n in linear.states]
+        return {key: self.place[key] for key in keys}
+
+    def _row_of(self, linear: _Linear, key: Key) -> slice:
+        start = 0
+        model = linear.component.model
+        for kind, names in (("slot", linear.outputs), ("state", list(linear.states))):
+            for name in names:
+                n = int(np.prod(model.shape(name)))
+                if (kind, name) == (key[0], key[2]):
+                    return slice(start, start + n)
+                start += n
+        raise KeyError(key)
+
+    def _move(self, ticks: list[tuple[int, list[_Call]]]) -> None:
+        """Move the covariances over some ticks, those with the same calls together."""
+        start = 0
+        while start < len(ticks):
+            kinds = [[(c.path, tuple(c.valid.items())) for c in calls] for _, calls in ticks[start:]]
+            n = 1
+            while n < len(kinds) and kinds[n] == kinds[0]:
+                n += 1
+            calls = [calls for _, calls in ticks[start : start + n]]
+            if calls[0]:
+                self._step([list(each) for each in zip(*calls, strict=True)])
+            start += n
+
+    def _step(self, calls: list[list[_Call]]) -> None:
+        """Move over n ticks at which the same components step: `calls[c][k]`."""
+        n = len(calls[0])
+        paths = [c[0].path for c in calls]
+        n_noise = {}
+        width = 0
+        for path in paths:
+            for name, size in self.linear[path].noise.items():
+                n_noise[path, name] = slice(self.size + width, self.size + width + size)
+                width += size
+        # every quantity as rows over (z before, noise of the tick)
+        rows = np.zeros((n, self.size, self.size + width))
+        rows[:, np.arange(self.size), np.arange(self.size)] = 1.0
+        for each in calls:
+            linear = self.linear[each[0].path]
+            if linear.step_jacobian is None:
+                continue
+            J = linear.evaluate(each)
+            parts = []
+            for kind, name in linear.columns(start=False):
+                size, place, factor = self._column(linear, kind, name)
+                if kind == "noise":
+                    block = np.zeros((n, size, self.size + width))
+                    at = n_noise[linear.path, name]
+                    block[:, np.arange(size), np.arange(at.start, at.stop)] = 1.0
+                elif place is None:
+                    block = np.zeros((n, size, self.size + width))
+                else:
+                    block = rows[:, place] if factor is None else rows[:, place] * factor[:, None]
+                parts.append(block)
+            changed = J @ np.concatenate(parts, axis=1)
+            for key, place in self._rows(linear, each[0].valid).items():
+                rows[:, place] = changed[:, self._row_of(linear, key)]
+        for key, slot in self.held.items():
+            if key[1] in paths and slot in self.place:
+                _, factor = self.linear[key[1]].inputs[key[2]]
+                block = rows[:, self.place[slot]]
+                rows[:, self.place[key]] = block if factor is None else block * factor[:, None]
+        F, G = rows[:, :, : self.size], rows[:, :, self.size :]
+        self._propagate(F, G, n_noise)
+
+    def _propagate(
+        self, F: FloatArray, G: FloatArray, n_noise: Mapping[tuple[str, str], slice]
+    ) -> None:
+        """Apply n transitions, in the space of what they move."""
+        moved = np.flatnonzero(
+            np.any(F != np.eye(self.size), axis=(0, 2)) | np.any(G != 0.0, axis=(0, 2))
+        )
+        used = np.flatnonzero(np.any(F[:, moved] != 0.0, axis=(0, 1)))
+        both = np.union1d(moved, used)
+        f = np.ascontiguousarray(F[np.ix_(range(len(F)), both, both)])
+        phi = np.eye(len(both))
+        Q = {}
+        for (path, name), at in n_noise.items():
+            g = G[:, both, at.start - self.size : at.stop - self.size]
+            if np.any(g):
+                Q[f"{path}.{name}"] = g @ g.transpose(0, 2, 1)
+        stack = np.stack([q[0] for q in Q.values()]) if Q else np.zeros((0, *phi.shape))
+        phi = f[0]
+        noise = list(Q.values())
+        for k in range(1, len(f)):
+            phi = f[k] @ phi
+            if noise:
+                stack = f[k] @ stack @ f[k].T
+                for i, q in enumerate(noise):
+                    stack[i] += q[k]
+        whole = np.eye(self.size)
+        whole[np.ix_(both, both)] = phi
+        self.C = whole @ self.C @ whole.T
+        for name, q in zip(Q, stack, strict=True):
+            self.C[np.ix_([self.sources.index(name)], both, both)] += q
+
+    # ------------------------------------------------------------------ the error
+
+    def _evaluate(self, t: float) -> None:
+        import casadi as ca
+
+        model = self.error_model
+        if not hasattr(self, "_error_jacobian"):
+            symbols = list(model.inputs.values())
+            by = ca.vertcat(*(ca.vec(s) for s in symbols))
+            self._error_jacobian = ca.Function(
+                "by", symbols, [ca.densify(ca.jacobian(ca.SX(model.outputs["error"]), by))]
+            )
+        evaluation = self.evaluation
+        values = []
+        E = np.zeros((int(model.outputs["error"].numel()), self.size))
+        for name in model.inputs:
+            head, _, tail = name.partition(".")
+            view = evaluation._views[head]
+            values.append(np.asarray(getattr(view, tail) if tail else view)[0])
+        J = np.asarray(self._error_jacobian(*values))
+        column = 0
+        for name in model.inputs:
+            size = int(np.prod(model.shape(name)))
+            found = self.source(self.evaluation_path, name)
+            assert found is not None
+            key, factor = self.slot_of(self.evaluation_path, name), found[1]
+            if key in self.place:
+                block = J[:, column : column + size]
+                E[:, self.place[key]] += block if factor is None else block * factor
+            column += size
+        covariance = E @ self.C @ E.T
+        given = {name: covariance[i] for i, name in enumerate(self.sources)}
+        self.errors.append((t, given))
+
+    def result(self) -> LinearCovariance:
+        """Gather what was predicted."""
+        times, history = self.simulation.history(self.evaluation_path)
+        sigma = np.concatenate(
+            [history[f"{q.name}_sigma"][:, 0] for q in self.evaluation.quantities], axis=1
+        )
+        if "covariance" in history:
+            filtered = history["covariance"][:, 0]
+        else:
+            filtered = sigma[:, :, None] ** 2 * np.eye(sigma.shape[1])
+        sources = {
+            name: np.stack([each[name] for _, each in self.errors]) for name in self.sources
+        }
+        quantities = self.evaluation.quantities
+        return LinearCovariance(
+            self.evaluation_path,
+            [f"{q.name} {axis}" for q in quantities for axis in q.axes],
+            [q.unit for q in quantities for _ in q.axes],
+            times,
+            filtered,
+            {name: c for name, c in sources.items() if np.any(c)},
+        )
+
+
+def _dispersed_covariance(d: Dispersion, components: Any, nominal: FloatArray) -> FloatArray:
+    """Covariance of a dispersion's draw, for a parameter of the given nominal value."""
+    spread = d.read_spread(components)
+    shape = np.shape(nominal)
+    value = np.asarray(nominal, dtype=np.float64).reshape(-1)
+    if d.kind == "multivariate":
+        return spread
+    if d.kind == "list":
+        flat = spread.reshape(len(spread), -1)
+        found: FloatArray = np.atleast_2d(np.cov(flat.T, bias=True))
+        return found
+    flat = np.broadcast_to(spread, shape).reshape(-1)
+    if d.kind == "normal":
+        return np.diag(flat**2)
+    if d.kind == "uniform":
+        return np.diag(flat**2 / 3)
+    if d.kind == "truncated":
+        from scipy.stats import truncnorm
+
+        return np.diag(flat**2 * truncnorm.var(-d.limit, d.limit))
+    return np.diag((value * np.log(flat)) ** 2 / 3)  # to first order
+
+
+def _directions(system: System, length: Any, result: LinearCovariance) -> list[Direction]:
+    """Compare the filter's covariance with that of a filter which gets no fix."""
+    deaf = Simulation(system, members=1, duration=length, recording=False, quiet=True)
+    try:
+        path = result.path
+        flat = deaf.plan.flat
+        corrector = next(
+            (
+                c.source.rpartition(".")[0]
+                for c in flat.connections
+                if c.target.rpartition(".")[0] == path
+                and flat.port(c.source).kind == "message"
+            ),
+            None,
+        )
+        if corrector is None or "covariance" not in flat.components[path].outputs():
+            return []
+        for name, port in flat.components[corrector].inputs().items():
+            if port.kind == "message":
+                reader = flat.components[corrector]._views[name]
+                reader.refresh = lambda tick: None  # noqa: ARG005
+                waiting = deaf.master._entries[corrector]
+                waiting.before = tuple(
+                    t for t in waiting.before if getattr(t, "__self__", None) is not reader
+                )
+        deaf.initialize()
+        deaf.run_until(length)
+        without = deaf.history(path)[1]["covariance"][-1, 0]
+    finally:
+        deaf.master.terminate()
+    from scipy.linalg import eigh
+
+    sigma = np.sqrt(np.diagonal(without))
+    scale = np.outer(sigma, sigma)
+    values, vectors = eigh(result.filter[-1] / scale, without / scale)
+    found = []
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        direction = (without / scale) @ vector
+        found.append(Direction(float(value), direction / np.linalg.norm(direction)))
+    return found
