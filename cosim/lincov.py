@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,8 +42,12 @@ from terrafix.cosim.wiring import port_factor
 FloatArray = NDArray[np.float64]
 Key = tuple[str, str, str]
 """(kind, component, name): kind ``"state"``, ``"slot"``, ``"held"`` or ``"parameter"``."""
-AT_ONCE = 1024
-"""Ticks whose Jacobians are evaluated together."""
+SCHEMA = "terrafix-lincov/1"
+AT_ONCE = 4096
+"""Ticks after which what was noted of the nominal run is worked off."""
+EVERY = 8
+"""Ticks that share a Jacobian, that of the middle one, where only one group of components steps
+and nothing is published but signals: a power of two. A spacecraft turns by 0.005 degrees then."""
 UNOBSERVED = 0.5
 """Part of a variance that fixes leave, above which its direction counts as not observed."""
 
@@ -112,6 +117,58 @@ class LinearCovariance:
         return [d for d in self.directions if d.remaining > UNOBSERVED]
 
 
+    def dataset(self) -> Any:
+        """As an `xarray.Dataset`."""
+        import xarray
+
+        n = len(self.labels)
+        both = ("time", "axis", "axis_b")
+        remaining = [d.remaining for d in self.directions]
+        vectors = [d.components for d in self.directions]
+        return xarray.Dataset(
+            {
+                "filter": (both, self.filter),
+                "error": (
+                    ("source", *both),
+                    np.stack(list(self.sources.values()))
+                    if self.sources
+                    else np.zeros((0, *self.filter.shape)),
+                ),
+                "remaining": ("direction", np.array(remaining, dtype=np.float64)),
+                "direction_components": (
+                    ("direction", "axis"),
+                    np.array(vectors, dtype=np.float64).reshape(-1, n),
+                ),
+            },
+            {
+                "time": ("time", self.times, {"units": "s"}),
+                "axis": self.labels,
+                "axis_b": self.labels,
+                "unit": ("axis", self.units),
+                "source": np.array(list(self.sources), dtype=object),
+            },
+            {"path": self.path, "schema": SCHEMA},
+        )
+
+    @classmethod
+    def of_dataset(cls, dataset: Any) -> LinearCovariance:
+        """The inverse of `dataset`."""
+        return cls(
+            str(dataset.attrs["path"]),
+            [str(v) for v in dataset["axis"].values],
+            [str(v) for v in dataset["unit"].values],
+            dataset["time"].values,
+            dataset["filter"].values,
+            {str(s): dataset["error"].values[i] for i, s in enumerate(dataset["source"].values)},
+            [
+                Direction(float(r), v)
+                for r, v in zip(
+                    dataset["remaining"].values, dataset["direction_components"].values, strict=True
+                )
+            ],
+        )
+
+
 def linear_covariance(system: System, *, duration: Exact | None = None) -> LinearCovariance:
     """Predict a campaign of a system.
 
@@ -149,17 +206,24 @@ class _Call(NamedTuple):
     valid: dict[str, bool]
 
 
+class _Noted(NamedTuple):
+    """The calls of one tick, and of how many ticks they are an example."""
+
+    calls: list[_Call]
+    repeat: int
+
+
 class _Listening(BoundKernel):
     """A kernel that notes what it is called with."""
 
     def __init__(self, component: _Linear, kernel: BoundKernel) -> None:
         self._component = component
-        self._kernel = kernel
+        self.kernel = kernel
 
     def __call__(self, step: int) -> int:
         component = self._component
         arguments = [a.reshape(-1).copy() for a in component.needed]
-        failed = self._kernel(step)
+        failed = self.kernel(step)
         messages = component.component._messages
         valid = {name: bool(flag[0] > 0.5) for name, flag in messages.items()}
         component.calls.append(_Call(component.path, arguments, valid))
@@ -192,9 +256,10 @@ class _Linear:
         self.outputs = [n for n in model.outputs if n in wanted and len(model.shape(n)) == 1]
         self.noise = {n: int(np.prod(model.shape(n))) for n in model.noise}
         self.step_jacobian, self.step_arguments = self._jacobian(ca, start=False)
-        self.start_jacobian, _ = self._jacobian(ca, start=True)
+        self.start_jacobian, self.start_arguments = self._jacobian(ca, start=True)
         arrays = component.arguments()
         self.needed = [arrays[n] for n in self.step_arguments]
+        self.listening = _Listening(self, component._call)
 
     def columns(self, *, start: bool) -> list[tuple[str, str]]:
         """What the Jacobian is taken by: (kind, name), in order."""
@@ -240,8 +305,13 @@ def _evaluated(function: Any, arguments: list[list[FloatArray]]) -> FloatArray:
     given = [np.stack(a, axis=1) for a in zip(*arguments, strict=True)]
     if not given:
         return np.broadcast_to(np.asarray(function()["o0"]), (n, rows, columns))
-    flat = np.asarray(function.map(n)(*given))
+    flat = np.asarray(_mapped(function, n)(*given))
     return flat.reshape(rows, n, columns).transpose(1, 0, 2)
+
+
+@lru_cache(maxsize=64)
+def _mapped(function: Any, n: int) -> Any:
+    return function.map(n)
 
 
 class _Analysis:
@@ -283,9 +353,6 @@ class _Analysis:
             for path, c in flat.components.items()
             if isinstance(c, SymbolicComponent)
         }
-        for linear in self.linear.values():
-            linear.component._call = _Listening(linear, linear.component._call)
-        self.log: list[_Call] = []
         self._lay_out()
         self.errors: list[tuple[float, dict[str, FloatArray]]] = []
 
@@ -393,51 +460,76 @@ class _Analysis:
 
     def fly(self, end: int) -> None:
         """Fly the nominal run and move the covariances along with it."""
-        master = self.simulation.master
-        rates = {p: c.rate for p, c in self.simulation.plan.flat.components.items()}
-        self._order_of = {path: i for i, path in enumerate(self.order)}
+        plan, master = self.simulation.plan, self.simulation.master
+        rate = self.evaluation.rate
+        assert rate is not None
+        self._epochs = {0} if rate.starts_at_zero else set()
+        for tick in rate.ticks(plan.base, plan.grid):
+            if tick > end:
+                break
+            self._epochs.add(tick)
+        self._place_of = {path: i for i, path in enumerate(self.order)}
+        self._programs: dict[bool, Any] = {True: {}, False: {}}
         self.simulation.initialize()
         self._start()
-        if rates[self.evaluation_path].starts_at_zero:  # type: ignore[union-attr]
+        if 0 in self._epochs:
             self._evaluate(0.0)
+        self._noted: list[_Noted] = []
         while master.tick < end:
-            # one tick at a time would cost a call each; the log says what happened at which
-            stop = min(end, master.tick + AT_ONCE)
-            self._watch(stop)
-        return
+            self._advance(end)
+        self._move()
 
-    def _watch(self, stop: int) -> None:
+    def _advance(self, end: int) -> None:
+        """Fly to the next tick; or a stretch of ticks, noting those whose Jacobians serve all."""
         master = self.simulation.master
-        ticks: list[tuple[int, list[_Call]]] = []
-        while master.tick < stop:
-            later = [g.next_tick for g in master._groups if g.next_tick is not None]
-            tick = min([*later, stop])
-            before = {p: len(x.calls) for p, x in self.linear.items()}
-            master.run_until(tick)
-            calls = [x.calls[-1] for p, x in self.linear.items() if len(x.calls) > before[p]]
-            calls.sort(key=lambda c: self._order_of[c.path])
-            ticks.append((tick, calls))
-            if tick in self._evaluation_ticks(stop):
-                self._move(ticks)
-                ticks = []
-                self._evaluate(master.seconds(tick))
-        self._move(ticks)
+        groups = [g for g in master._groups if g.next_tick is not None]
+        first = min(g.next_tick for g in groups)
+        if first > end:
+            self._run(end, listening=False)
+            return
+        due = [g for g in groups if g.next_tick == first]
+        self._note(first, 1)
+        group = due[0]
+        if len(due) > 1 or not group.spacing or not self._regular(group):
+            return
+        others = [g.next_tick for g in groups if g is not group]
+        last = min([end, *(tick - 1 for tick in others)])
+        n_blocks = ((last - first) // group.spacing - 1) // EVERY
+        for _ in range(max(n_blocks, 0)):
+            start = master.tick
+            self._run(start + (EVERY // 2 - 1) * group.spacing, listening=False)
+            self._note(start + EVERY // 2 * group.spacing, EVERY)
+            self._run(start + EVERY * group.spacing, listening=False)
+
+    def _regular(self, group: Any) -> bool:
+        """Whether the components that step with a group publish signals alone."""
+        master = self.simulation.master
+        number = master._groups.index(group)
+        mine = [p for p, n in master._group_of.items() if n == number]
+        return bool(mine) and all(
+            p in self.linear and not self.linear[p].component._messages for p in mine
+        )
+
+    def _run(self, tick: int, *, listening: bool) -> None:
+        """Fly on; stretches of ticks are handed to compiled code where nobody listens."""
+        master = self.simulation.master
+        for linear in self.linear.values():
+            linear.component._call = linear.listening if listening else linear.listening.kernel
+        master._programs = self._programs[listening]
+        master.run_until(tick)
+
+    def _note(self, tick: int, repeat: int) -> None:
         for linear in self.linear.values():
             linear.calls.clear()
-
-    def _evaluation_ticks(self, stop: int) -> set[int]:
-        known: dict[int, set[int]] = self.__dict__.setdefault("_known_ticks", {})
-        if stop not in known:
-            plan = self.simulation.plan
-            rate = self.evaluation.rate
-            assert rate is not None
-            found = set()
-            for tick in rate.ticks(plan.base, plan.grid, after=max(known, default=0)):
-                if tick > stop:
-                    break
-                found.add(tick)
-            known[stop] = found
-        return known[stop]
+        self._run(tick, listening=True)
+        calls = [call for linear in self.linear.values() for call in linear.calls]
+        calls.sort(key=lambda call: self._place_of[call.path])
+        self._noted.append(_Noted(calls, repeat))
+        if tick in self._epochs:
+            self._move()
+            self._evaluate(self.simulation.master.seconds(tick))
+        elif len(self._noted) > AT_ONCE:
+            self._move()
 
     def _start(self) -> None:
         """Deviations at t = 0."""
@@ -448,8 +540,8 @@ class _Analysis:
             arrays = linear.component.arguments()
             arrays |= {n: np.zeros((1, size)) for n, size in linear.noise.items()}
             arrays |= {"step": np.zeros(1), "time": np.zeros(1)}
-            _, needed = linear._jacobian(__import__("casadi"), start=True)
-            J = _evaluated(linear.start_jacobian, [[arrays[n].reshape(-1) for n in needed]])[0]
+            given = [arrays[n].reshape(-1) for n in linear.start_arguments]
+            J = _evaluated(linear.start_jacobian, [given])[0]
             F, G = np.eye(self.size), {}
             rows = self._rows(linear, dict.fromkeys(linear.component._messages, True))
             column = 0
@@ -516,21 +608,27 @@ class _Analysis:
                 start += n
         raise KeyError(key)
 
-    def _move(self, ticks: list[tuple[int, list[_Call]]]) -> None:
-        """Move the covariances over some ticks, those with the same calls together."""
-        start = 0
-        while start < len(ticks):
-            kinds = [[(c.path, tuple(c.valid.items())) for c in calls] for _, calls in ticks[start:]]
+    def _move(self) -> None:
+        """Move the covariances over what was noted, what is alike together."""
+        start, noted = 0, self._noted
+        kinds = [
+            ([(c.path, tuple(c.valid.items())) for c in each.calls], each.repeat) for each in noted
+        ]
+        while start < len(noted):
             n = 1
-            while n < len(kinds) and kinds[n] == kinds[0]:
+            while start + n < len(kinds) and kinds[start + n] == kinds[start]:
                 n += 1
-            calls = [calls for _, calls in ticks[start : start + n]]
+            calls = [each.calls for each in noted[start : start + n]]
             if calls[0]:
-                self._step([list(each) for each in zip(*calls, strict=True)])
+                self._step([list(each) for each in zip(*calls, strict=True)], noted[start].repeat)
             start += n
+        self._noted = []
 
-    def _step(self, calls: list[list[_Call]]) -> None:
-        """Move over n ticks at which the same components step: `calls[c][k]`."""
+    def _step(self, calls: list[list[_Call]], repeat: int) -> None:
+        """Move over n ticks at which the same components step, each of them `repeat` times.
+
+        `calls[c][k]` is the call of component c at tick k.
+        """
         n = len(calls[0])
         paths = [c[0].path for c in calls]
         n_noise = {}
@@ -568,38 +666,53 @@ class _Analysis:
                 block = rows[:, self.place[slot]]
                 rows[:, self.place[key]] = block if factor is None else block * factor[:, None]
         F, G = rows[:, :, : self.size], rows[:, :, self.size :]
-        self._propagate(F, G, n_noise)
+        self._propagate(F, G, n_noise, repeat)
 
     def _propagate(
-        self, F: FloatArray, G: FloatArray, n_noise: Mapping[tuple[str, str], slice]
+        self,
+        F: FloatArray,
+        G: FloatArray,
+        n_noise: Mapping[tuple[str, str], slice],
+        repeat: int,
     ) -> None:
-        """Apply n transitions, in the space of what they move."""
-        moved = np.flatnonzero(
-            np.any(F != np.eye(self.size), axis=(0, 2)) | np.any(G != 0.0, axis=(0, 2))
-        )
+        """Apply n transitions, each `repeat` times (a power of two).
+
+        Up to the last of all, only what the next one reads is moved; where transitions are
+        repeated, one that is not comes after them.
+        """
+        eye = np.eye(self.size)
+        moved = np.flatnonzero(np.any(F != eye, axis=(0, 2)) | np.any(G != 0.0, axis=(0, 2)))
         used = np.flatnonzero(np.any(F[:, moved] != 0.0, axis=(0, 1)))
-        both = np.union1d(moved, used)
-        f = np.ascontiguousarray(F[np.ix_(range(len(F)), both, both)])
-        phi = np.eye(len(both))
-        Q = {}
+        noise = {}
         for (path, name), at in n_noise.items():
-            g = G[:, both, at.start - self.size : at.stop - self.size]
+            g = G[:, :, at.start - self.size : at.stop - self.size]
             if np.any(g):
-                Q[f"{path}.{name}"] = g @ g.transpose(0, 2, 1)
-        stack = np.stack([q[0] for q in Q.values()]) if Q else np.zeros((0, *phi.shape))
-        phi = f[0]
-        noise = list(Q.values())
-        for k in range(1, len(f)):
+                noise[f"{path}.{name}"] = g
+        f = np.ascontiguousarray(F[np.ix_(range(len(F)), used, used)])
+        phi = np.eye(len(used))
+        added = np.zeros((len(noise), len(used), len(used)))
+        q = [g[:, used] @ g[:, used].transpose(0, 2, 1) for g in noise.values()]
+        done = 1
+        while done < repeat:
+            q = [f @ each @ f.transpose(0, 2, 1) + each for each in q]
+            f = f @ f
+            done *= 2
+        for k in range(len(f) - (repeat == 1)):
             phi = f[k] @ phi
-            if noise:
-                stack = f[k] @ stack @ f[k].T
-                for i, q in enumerate(noise):
-                    stack[i] += q[k]
-        whole = np.eye(self.size)
-        whole[np.ix_(both, both)] = phi
+            if q:
+                added = f[k] @ added @ f[k].T
+                for i, each in enumerate(q):
+                    added[i] += each[k]
+        whole = eye.copy()
+        whole[np.ix_(used, used)] = phi
         self.C = whole @ self.C @ whole.T
-        for name, q in zip(Q, stack, strict=True):
-            self.C[np.ix_([self.sources.index(name)], both, both)] += q
+        for i, name in enumerate(noise):
+            self.C[np.ix_([self.sources.index(name)], used, used)] += added[i]
+        if repeat > 1:
+            return
+        self.C = F[-1] @ self.C @ F[-1].T
+        for name, g in noise.items():
+            self.C[self.sources.index(name)] += g[-1] @ g[-1].T
 
     # ------------------------------------------------------------------ the error
 

@@ -46,6 +46,8 @@ class Panel:
     error : ndarray, shape (n, n_members)
     predicted : ndarray, shape (n,)
         One sigma.
+    sample, mean : ndarray, shape (n,), optional
+        Of all members, where `error` holds some of them; computed from `error` if absent.
     """
 
     title: str
@@ -54,6 +56,8 @@ class Panel:
     times: FloatArray
     error: FloatArray
     predicted: FloatArray
+    sample: FloatArray | None = None
+    mean: FloatArray | None = None
 
 
 def plot_result(dataset: xarray.Dataset, path: str | Path) -> None:
@@ -172,7 +176,7 @@ def _evaluation_figure(
             for row, panel in enumerate(panels):
                 ax = axes[row, column]
                 ax.set_visible(True)
-                handles |= _draw_panel(ax, panel)
+                handles |= draw_panel(ax, panel)
                 if row == 0:
                     ax.set_title(f"{panel.title} error [{panel.unit}]", fontsize=10)
                 if row == len(panels) - 1:
@@ -199,7 +203,7 @@ def _headline(dataset: xarray.Dataset) -> str:
     return text
 
 
-def _draw_panel(ax: Any, panel: Panel) -> dict[str, Any]:
+def draw_panel(ax: Any, panel: Panel) -> dict[str, Any]:
     """Draw one axis; gives the handles for the legend by what they mean."""
     from matplotlib.collections import LineCollection
 
@@ -218,10 +222,10 @@ def _draw_panel(ax: Any, panel: Panel) -> dict[str, Any]:
     handles["predicted 3 sigma"] = _both_signs(ax, panel.times, spread, PREDICTED, "-")
     bounds = [spread, np.abs(panel.error).max(axis=1, initial=0.0, where=np.isfinite(panel.error))]
     if ensemble:
-        sample = 3 * sample_sigma(panel.error)
+        sample = 3 * (sample_sigma(panel.error) if panel.sample is None else panel.sample)
         handles["sample 3 sigma"] = _both_signs(ax, panel.times, sample, SAMPLE, (0, (4, 2)))
-        mean = _thinned(panel.times, member_mean(panel.error)[:, None])
-        (line,) = ax.plot(*mean, color="black", linestyle="--", linewidth=1.0, zorder=4)
+        mean = member_mean(panel.error) if panel.mean is None else panel.mean
+        (line,) = ax.plot(*_thinned(panel.times, mean[:, None]), color="black", linestyle="--", linewidth=1.0, zorder=4)
         handles["sample mean"] = line
         bounds.append(sample)
     _limit(ax, panel.times, bounds)

@@ -88,6 +88,7 @@ class CampaignResult:
     parameters: dict[str, Any] = field(default_factory=dict)
     parameter_units: dict[str, str] = field(default_factory=dict)
     graph: str = ""
+    source: dict[str, Any] = field(default_factory=dict)
     out: Path | None = None
 
     def summary(self) -> dict[str, Any]:
@@ -188,6 +189,7 @@ def run_campaign(
             statistics={path: Statistics(layout) for path, layout in found.items()},
             workers="",
             setup_s=0.0,
+            source=_described(source),
             parameter_units={name: unit for name, (unit, _) in simulation.parameters.items()},
         )
         size = batch or members_per_batch(simulation, found)
@@ -234,6 +236,13 @@ def _check_numbers(
     if out is None and (resume or histories):
         what = "resume a campaign" if resume else "keep histories"
         raise ConfigurationError(f"to {what}, say where its folder is\n  give --out DIR")
+
+
+def _described(source: FileSource | System) -> dict[str, Any]:
+    """Where the system was read from, for reports that read it again."""
+    if isinstance(source, System):
+        return {}
+    return {"path": str(Path(source.path).absolute()), "settings": [*map(list, source.settings)]}
 
 
 def _drawn(system: System) -> str:

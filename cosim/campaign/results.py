@@ -209,6 +209,7 @@ def _attributes(result: CampaignResult) -> dict[str, Any]:
         "verdicts": verdicts,
         "configuration": result.configuration,
         "graph": result.graph,
+        "source": result.source,
         "versions": versions(),
         "paths": list(result.statistics),
     }

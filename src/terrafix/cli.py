@@ -378,6 +378,62 @@ def campaign(
     return 0
 
 
+@main.command()
+@_system
+@_set
+@click.option("--duration", metavar="S", help='Simulated time, exact: "590.4" or "10 min".')
+@_json
+def lincov(system: str, settings: Settings, duration: str | None, as_json: bool) -> int:
+    """Predict a campaign by linear covariance analysis: sigma, error budget, observability."""
+    from terrafix.cosim.lincov import linear_covariance
+    from terrafix.cosim.lincov_display import prediction_tables, summary
+
+    loaded = _read(system, settings)
+    found = linear_covariance(loaded, duration=duration)
+    if as_json:
+        _print_json(summary(found))
+    else:
+        _show(*prediction_tables(loaded.name, found))
+    return 0
+
+
+@main.command()
+@click.argument("result", metavar="RESULT")
+@click.option("-o", "--out", metavar="FILE.html", help="The page; RESULT/report.html if absent.")
+@click.option("--figures", metavar="DIR", help="Write each figure to a file in this folder too.")
+@click.option(
+    "--format", "form", type=click.Choice(["png", "svg", "pdf"]), default="png", help="Of figures."
+)
+@click.option("--no-lincov", is_flag=True, help="Leave out the linear covariance analysis.")
+@_json
+def report(
+    result: str, out: str | None, figures: str | None, form: str, no_lincov: bool, as_json: bool
+) -> int:
+    """Write the page of a campaign: statistics, figures, error budget, how to repeat it."""
+    from terrafix.cosim.report.figures import save_figures
+    from terrafix.cosim.report.report import write_report
+
+    target = _target("-o", out, (".html", ".htm"))
+    path, campaign_read = write_report(result, target, analyze=not no_lincov)
+    written = [path]
+    if figures is not None:
+        several = len(campaign_read.paths) > 1
+        for name in campaign_read.paths:
+            folder = Path(figures, name) if several else Path(figures)
+            prediction = campaign_read.prediction
+            mine = prediction if prediction is not None and prediction.path == name else None
+            part = campaign_read.part(name)
+            written += save_figures(part, folder, form=form, prediction=mine)
+    if as_json:
+        _print_json({"written": [str(p) for p in written], "notes": campaign_read.notes})
+    else:
+        for each in written:
+            print(f"wrote {each}")
+        for note in campaign_read.notes:
+            print(f"note: {note}", file=sys.stderr)
+    return 0
+
+
 def _runs(runs: int | None, out: str | None, *, resume: bool) -> int:
     """How many members: as said, or as the folder says that is resumed."""
     if runs is not None:
