@@ -65,6 +65,18 @@ EXPORT void terrafix_draw(V *const *noise, const int64_t *size, const U *members
     normals(u, waiting);
 }
 
+/* n vectors of uniforms to normals, in place. */
+EXPORT void terrafix_normals(V *vectors, int64_t n)
+{
+    V *u[MOST];
+    for (int64_t start = 0; start < n; start += MOST) {
+        int count = n - start < MOST ? (int)(n - start) : MOST;
+        for (int i = 0; i < count; i++)
+            u[i] = vectors + start + i;
+        normals(u, count);
+    }
+}
+
 EXPORT void terrafix_prepare(const V *const *argument, V *invariant)
 {
     prepare(argument, invariant);

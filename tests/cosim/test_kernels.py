@@ -27,7 +27,9 @@ needs_compiler = pytest.mark.skipif(
     not any(toolchain._identify(command) for command in toolchain._commands()),
     reason="no C compiler",
 )
-both = pytest.mark.parametrize("kind", [pytest.param("c", marks=needs_compiler), "vm"])
+COMPILED = [pytest.param(kind, marks=needs_compiler) for kind in ("vector", "c")]
+both = pytest.mark.parametrize("kind", [*COMPILED, "vm"])
+compiled = pytest.mark.parametrize("kind", COMPILED)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +141,7 @@ def test_compiled_and_virtual_agree_to_the_last_bit(n_members, monkeypatch):
         [Result("x", n), Result("p", n * n)],
     )
     ends = []
-    for kind in ("c", "vm"):
+    for kind in ("vector", "c", "vm"):
         rng = np.random.default_rng(3)
         arrays = {"x": rng.normal(size=(n_members, n)), "p": rng.normal(size=(n_members, n, n))}
         call = build(kind, specification, monkeypatch).bind(
@@ -153,7 +155,7 @@ def test_compiled_and_virtual_agree_to_the_last_bit(n_members, monkeypatch):
         )
         assert sum(call(step) for step in range(50)) == 0
         ends.append(arrays["x"].tobytes() + arrays["p"].tobytes())
-    assert ends[0] == ends[1]
+    assert ends[0] == ends[1] == ends[2]
 
 
 def pointwise(name: str, n: int, expression) -> Specification:
@@ -183,7 +185,7 @@ def evaluate(kernel, members, step: int) -> np.ndarray:
 def test_transcendental_functions_agree_to_rounding(monkeypatch):
     """Mathematical libraries may differ, by a unit in the last place each of three functions."""
     specification = pointwise("wave", 5, lambda w: ca.sin(w) * ca.exp(-w) + ca.atan2(w, 2))
-    y = [evaluate(build(k, specification, monkeypatch), range(7), 3) for k in ("c", "vm")]
+    y = [evaluate(build(k, specification, monkeypatch), range(7), 3) for k in ("vector", "c", "vm")]
     w = NormalStream.from_key(KEY, np.arange(7)).draw(3, 5)
     for computed in y:
         np.testing.assert_allclose(
@@ -213,7 +215,7 @@ def test_generated_code_is_free_of_null_checks():
         assert "if (" not in body
 
 
-@both
+@pytest.mark.parametrize("kind", [pytest.param("c", marks=needs_compiler), "vm"])
 def test_functions_that_call_functions_are_kernels_too(kind, monkeypatch):
     """MX code passes null pointers within: its checks must stay."""
     a, b = ca.SX.sym("a", 2), ca.SX.sym("b", 2)
@@ -223,30 +225,44 @@ def test_functions_that_call_functions_are_kernels_too(kind, monkeypatch):
     function = ca.Function("outer", [w], [first[0] + second[0]])
     specification = Specification(function, [Argument("w", 2, "noise")], [Result("y", 2)])
     y = evaluate(build(kind, specification, monkeypatch), range(7), 1)
+    assert kind == "vm" or build_kernel(*specification).kind == "c"  # of itself
+    monkeypatch.setenv("TERRAFIX_KERNEL", "vector")
+    if kind == "c":
+        with pytest.raises(ConfigurationError, match="'outer' cannot be one: it is a MXFunction"):
+            build_kernel(*specification)
     w = NormalStream.from_key(KEY, np.arange(7)).draw(1, 2)
     assert y.tobytes() == (w + 2 * w).tobytes()
 
 
-@needs_compiler
-def test_a_million_draws_are_the_same_in_c_and_numpy(monkeypatch):
-    kernel = build("c", pointwise("noise", 1000, lambda w: w), monkeypatch)
+@compiled
+def test_a_million_draws_are_the_same_in_c_and_numpy(kind, monkeypatch):
+    kernel = build(kind, pointwise("noise", 1000, lambda w: w), monkeypatch)
     for step in range(2):
         expected = NormalStream.from_key(KEY, np.arange(600)).draw(step, 1000)
         assert evaluate(kernel, range(600), step).tobytes() == expected.tobytes()
 
 
-@needs_compiler
-def test_every_branch_of_the_quantile_is_the_same_in_c_and_numpy(monkeypatch):
+@compiled
+def test_every_branch_of_the_quantile_is_the_same_in_c_and_numpy(kind, monkeypatch):
     """Far tails, which a million draws never reach, both signs, and the seams between."""
-    kernel = build("c", pointwise("noise", 1, lambda w: w), monkeypatch)
+    kernel = build(kind, pointwise("noise", 1, lambda w: w), monkeypatch)
     rng = np.random.default_rng(8)
     tails = np.concatenate(
         [2.0**-53 * np.arange(1, 40_000, 2), 10 ** rng.uniform(-15.5, -1, 10**5)]
     )
     seams = [c + k * 2.0**-53 for c in (0.075, 0.925, 0.5, np.exp(-25)) for k in range(-50, 50)]
     u = np.concatenate([tails, 1 - tails, rng.uniform(size=10**5), seams])
+    u = rng.permutation(u[: len(u) // 64 * 64])
     z = u.copy()
-    kernel._library["terrafix_quantile"](ctypes.c_void_p(z.ctypes.data), ctypes.c_int64(z.size))
+    if kind == "c":
+        kernel._library["terrafix_quantile"](ctypes.c_void_p(z.ctypes.data), ctypes.c_int64(z.size))
+    else:
+        whole = np.empty(len(u) + 8)
+        start = -whole.ctypes.data % 64 // 8
+        z = whole[start : start + len(u)]
+        z[:] = u
+        n = ctypes.c_int64(z.size // kernel.lanes)
+        kernel._library["terrafix_normals"](ctypes.c_void_p(z.ctypes.data), n)
     assert (normal_quantile(u) < -7).sum() > 1000  # the far tail is reached
     assert z.tobytes() == normal_quantile(u).tobytes()
 
@@ -553,7 +569,9 @@ def test_the_compiler_is_named(monkeypatch):
     kernel = build_kernel(*walk())
     assert kernel.note == ""
     compiler = toolchain.find_compiler()
-    assert toolchain.describe([kernel]) == f"kernels: {compiler.name}, plain C"
+    assert toolchain.describe([kernel]) == f"kernels: {compiler.name}, vectors of members"
+    monkeypatch.setenv("TERRAFIX_KERNEL", "c")
+    assert toolchain.describe([build_kernel(*walk())]) == f"kernels: {compiler.name}, plain C"
     assert any(character.isdigit() for character in compiler.name)
 
 
@@ -605,13 +623,14 @@ def test_a_compiler_that_does_not_work_is_passed_over_for_the_next(monkeypatch):
     real = next(toolchain._commands())
     monkeypatch.setattr(toolchain, "_commands", lambda: iter([("/bin/false",), real]))
     kernel = build_kernel(*walk())
-    assert kernel.kind == "c"
+    assert kernel.kind == "vector"
     assert "false" not in toolchain.describe([kernel])
 
 
 @needs_compiler
 def test_one_refused_kernel_leaves_the_others_compiled(monkeypatch):
     """A function that has the name of a C function cannot be compiled, but interpreted."""
+    monkeypatch.setattr(toolchain, "VECTOR_FLAGS", ("-no-such-flag",))
     kernels = build_kernels([walk(), pointwise("sqrt", 3, lambda w: w)])
     assert [kernel.kind for kernel in kernels] == ["c", "vm"]
     line = toolchain.describe(kernels)
@@ -627,10 +646,49 @@ def test_the_virtual_machine_can_be_chosen(monkeypatch):
 
 def test_an_unknown_choice_is_refused(monkeypatch):
     monkeypatch.setenv("TERRAFIX_KERNEL", "fast")
-    with pytest.raises(ConfigurationError, match="TERRAFIX_KERNEL is 'fast'; write 'c' for"):
+    with pytest.raises(ConfigurationError, match="TERRAFIX_KERNEL is 'fast'; write 'vector' for"):
         build_kernel(*walk())
 
 
 def test_importing_kernels_does_not_import_casadi():
     code = "import sys, terrafix.cosim.kernels; sys.exit('casadi' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@needs_compiler
+def test_every_operation_of_vectors_is_that_of_the_virtual_machine(monkeypatch):
+    """Comparisons, choices, signs, minima, NaN on the way, and the library where lanes differ."""
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    results = [
+        ca.if_else(x < y, x - y, ca.atan2(x, y)),
+        ca.if_else(ca.logic_and(x <= 0.5, ca.logic_not(y == 0)), ca.sin(x), ca.fabs(y)),
+        ca.if_else(ca.logic_or(x != 1.0, y > 2), ca.sign(x), 7.0),
+        ca.fmin(x, y) + ca.fmax(x, 2.0) * ca.copysign(x, y),
+        ca.floor(x) + ca.ceil(y) - ca.fmod(x, 0.75),
+        ca.if_else(y > 0, ca.log(y), 0.0),
+        -(x**2) + 2 * y + 1 / (1 + x * x) + ca.sqrt(1 + y * y) + x**3,
+        ca.exp(-ca.fabs(x)) + ca.tanh(y) + ca.hypot(x, y) + ca.erf(x),
+    ]
+    function = ca.Function("everything", [x, y], [ca.vertcat(*results)])
+    specification = Specification(
+        function, [Argument("x", 1, "array"), Argument("y", 1, "array")], [Result("z", 8)]
+    )
+    values = np.array([-2.5, -1.0, -0.0, 0.0, 0.5, 1.0, 1.75, 3.0])
+    grid = np.stack(np.meshgrid(values, values), axis=-1).reshape(-1, 2)
+    alike = np.full((16, 2), 0.375)
+    for cases in (grid, alike):
+        found = []
+        for kind in ("vector", "vm"):
+            z = np.zeros((len(cases), 8))
+            build(kind, specification, monkeypatch).bind(
+                len(cases),
+                {"x": cases[:, 0].copy(), "y": cases[:, 1].copy()},
+                {"z": z},
+                members=np.arange(len(cases)),
+                noise_keys={},
+                active=np.ones(len(cases), dtype=bool),
+                failed=np.zeros(len(cases), dtype=np.uint8),
+            )(0)
+            found.append(z)
+        np.testing.assert_allclose(*found, rtol=1e-15, atol=0)
+        assert np.isfinite(found[0]).all()

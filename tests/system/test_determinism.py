@@ -53,8 +53,8 @@ def test_a_member_of_an_ensemble_equals_the_same_member_alone(hundred, members):
     assert_same_bytes(hundred.sel(member=members), fly(members))
 
 
-@pytest.mark.parametrize("kernel", ["vm"])
-def test_kernels_of_both_kinds_agree(hundred, kernel, monkeypatch):
+@pytest.mark.parametrize("kernel", ["vm", "c"])
+def test_kernels_of_all_kinds_agree(hundred, kernel, monkeypatch):
     """Arithmetic is bit-identical; sine and cosine of the C library and CasADi's may differ."""
     monkeypatch.setenv("TERRAFIX_KERNEL", kernel)
     alone = fly([0, 41])
