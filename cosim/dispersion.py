@@ -147,9 +147,7 @@ class Dispersion:
             f"  {nearest(name, numeric, what='numeric parameters')}"
         )
 
-    def read_spread(
-        self, components: Mapping[str, Component], *, bare: bool = True
-    ) -> FloatArray:
+    def read_spread(self, components: Mapping[str, Component], *, bare: bool = True) -> FloatArray:
         """The spread as an array in the targets' unit; ConfigurationError if it cannot be one.
 
         `bare` allows numbers without a unit.

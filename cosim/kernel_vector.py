@@ -46,7 +46,7 @@ _CALLS = {f"OP_{name.upper()}": (name, n) for n, all_ in _LIBRARY.items() for na
 _CALLS["OP_CONSTPOW"] = ("pow", 2)
 
 
-class NoVectors(Exception):
+class NoVectorsError(Exception):
     """A function that cannot be turned into vector code; the text says why."""
 
 
@@ -78,7 +78,7 @@ def _expression(operation: str, operands: list[str], guard: str | None) -> str:
         if guard is not None:
             return f"{macro}_IF(IS_TRUE({guard}), {name}, {', '.join(operands)})"
         return f"{macro}({name}, {', '.join(operands)})"
-    raise NoVectors(f"it uses {operation}")
+    raise NoVectorsError(f"it uses {operation}")
 
 
 def _literal(value: float) -> str:
@@ -145,7 +145,7 @@ class _Writer:
     def __init__(self, kernel: Kernel) -> None:
         if not kernel.function.is_a("SXFunction"):
             kind = kernel.function.class_name()
-            raise NoVectors(f"it is a {kind}, not made of scalar expressions")
+            raise NoVectorsError(f"it is a {kind}, not made of scalar expressions")
         self._constant = [a.kind in ("constant", "step") for a in kernel.arguments]
         self.prepare: list[str] = []
         self.advance: list[str] = []
@@ -203,7 +203,7 @@ def vector_source(kernel: Kernel) -> tuple[str, int]:
 
     Raises
     ------
-    NoVectors
+    NoVectorsError
         If the function is not made of scalar instructions that this knows.
     """
     writer = _Writer(kernel)
@@ -282,4 +282,5 @@ class VectorBinding(BoundKernel):
         self._alone = Stretch([stage])
 
     def __call__(self, step: int) -> int:
+        """Step all active members."""
         return self._alone.tick(step, *(float(clock[0, 0]) for clock in self._clock))

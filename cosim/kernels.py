@@ -24,7 +24,7 @@ from terrafix.cosim import toolchain
 from terrafix.cosim.errors import ConfigurationError
 from terrafix.cosim.kernel_base import Argument, BoundKernel, Kernel, Result, Specification
 from terrafix.cosim.kernel_compiled import CompiledKernel, kernel_source
-from terrafix.cosim.kernel_vector import NoVectors, VectorKernel, vector_source
+from terrafix.cosim.kernel_vector import NoVectorsError, VectorKernel, vector_source
 from terrafix.cosim.kernel_virtual import VirtualMachineKernel
 
 __all__ = [
@@ -111,7 +111,7 @@ def _candidates(kernel: Kernel) -> list[_Candidate]:
         return [_plain(kernel)]
     try:
         source, n_invariants = vector_source(kernel)
-    except NoVectors as error:
+    except NoVectorsError as error:
         if wanted == "vector":
             raise ConfigurationError(
                 f"TERRAFIX_KERNEL=vector asks for vector kernels, and '{kernel.name}' cannot be "

@@ -116,7 +116,6 @@ class LinearCovariance:
         """Directions of which the fixes leave more than `UNOBSERVED`."""
         return [d for d in self.directions if d.remaining > UNOBSERVED]
 
-
     def dataset(self) -> Any:
         """As an `xarray.Dataset`."""
         import xarray
@@ -274,11 +273,11 @@ class _Linear:
         states = [] if start else [f"state:{n}" for n in model.states]
         names = [*model.inputs, *states, *model.parameters, *model.noise]
         names += ["step"] * (model.step is not None) + ["time"] * (model.time is not None)
-        symbols = {
-            n: ca.SX.sym(f"a{i}", function.numel_in(i)) for i, n in enumerate(names)
-        }
+        symbols = {n: ca.SX.sym(f"a{i}", function.numel_in(i)) for i, n in enumerate(names)}
         results = function.call(list(symbols.values()))
-        result_of = dict(zip([*model.outputs, *(f"state:{n}" for n in model.states)], results, strict=True))
+        result_of = dict(
+            zip([*model.outputs, *(f"state:{n}" for n in model.states)], results, strict=True)
+        )
         rows = [result_of[n] for n in self.outputs] + [result_of[f"state:{n}"] for n in self.states]
         prefix = {"state": "state:", "input": "", "parameter": "", "noise": ""}
         by = [symbols[prefix[kind] + n] for kind, n in self.columns(start=start)]
@@ -286,12 +285,8 @@ class _Linear:
             return None, []
         jacobian = ca.densify(ca.jacobian(ca.vertcat(*rows), ca.vertcat(*by)))
         free = {e.element_hash() for e in ca.symvar(jacobian)}
-        needed = [
-            n for n in names if any(e.element_hash() in free for e in symbols[n].elements())
-        ]
-        made = ca.Function(
-            "jacobian", [symbols[n] for n in needed], [jacobian], {"cse": True}
-        )
+        needed = [n for n in names if any(e.element_hash() in free for e in symbols[n].elements())]
+        made = ca.Function("jacobian", [symbols[n] for n in needed], [jacobian], {"cse": True})
         return made, needed
 
     def evaluate(self, calls: list[_Call]) -> FloatArray:
@@ -482,17 +477,17 @@ class _Analysis:
     def _advance(self, end: int) -> None:
         """Fly to the next tick; or a stretch of ticks, noting those whose Jacobians serve all."""
         master = self.simulation.master
-        groups = [g for g in master._groups if g.next_tick is not None]
-        first = min(g.next_tick for g in groups)
+        pending = [(g.next_tick, g) for g in master._groups if g.next_tick is not None]
+        first = min(tick for tick, _ in pending)
         if first > end:
             self._run(end, listening=False)
             return
-        due = [g for g in groups if g.next_tick == first]
+        due = [g for tick, g in pending if tick == first]
         self._note(first, 1)
         group = due[0]
         if len(due) > 1 or not group.spacing or not self._regular(group):
             return
-        others = [g.next_tick for g in groups if g is not group]
+        others = [tick for tick, g in pending if g is not group]
         last = min([end, *(tick - 1 for tick in others)])
         n_blocks = ((last - first) // group.spacing - 1) // EVERY
         for _ in range(max(n_blocks, 0)):
@@ -542,7 +537,8 @@ class _Analysis:
             arrays |= {"step": np.zeros(1), "time": np.zeros(1)}
             given = [arrays[n].reshape(-1) for n in linear.start_arguments]
             J = _evaluated(linear.start_jacobian, [given])[0]
-            F, G = np.eye(self.size), {}
+            F = np.eye(self.size)
+            G: dict[str, FloatArray] = {}
             rows = self._rows(linear, dict.fromkeys(linear.component._messages, True))
             column = 0
             for row in rows.values():
@@ -590,9 +586,7 @@ class _Analysis:
     def _rows(self, linear: _Linear, valid: Mapping[str, bool]) -> dict[Key, slice]:
         """What a step changes in z: states, and outputs that were published."""
         keys: list[Key] = [
-            ("slot", linear.path, n)
-            for n in linear.outputs
-            if valid.get(n.partition(".")[0], True)
+            ("slot", linear.path, n) for n in linear.outputs if valid.get(n.partition(".")[0], True)
         ]
         keys += [("state", linear.path, n) for n in linear.states]
         return {key: self.place[key] for key in keys}
@@ -681,14 +675,14 @@ class _Analysis:
         repeated, one that is not comes after them.
         """
         eye = np.eye(self.size)
-        moved = np.flatnonzero(np.any(F != eye, axis=(0, 2)) | np.any(G != 0.0, axis=(0, 2)))
+        moved = np.flatnonzero(np.any(eye != F, axis=(0, 2)) | np.any(G != 0.0, axis=(0, 2)))
         used = np.flatnonzero(np.any(F[:, moved] != 0.0, axis=(0, 1)))
         noise = {}
         for (path, name), at in n_noise.items():
             g = G[:, :, at.start - self.size : at.stop - self.size]
             if np.any(g):
                 noise[f"{path}.{name}"] = g
-        f = np.ascontiguousarray(F[np.ix_(range(len(F)), used, used)])
+        f = np.ascontiguousarray(F[:, used][:, :, used])
         phi = np.eye(len(used))
         added = np.zeros((len(noise), len(used), len(used)))
         q = [g[:, used] @ g[:, used].transpose(0, 2, 1) for g in noise.values()]
@@ -707,7 +701,7 @@ class _Analysis:
         whole[np.ix_(used, used)] = phi
         self.C = whole @ self.C @ whole.T
         for i, name in enumerate(noise):
-            self.C[np.ix_([self.sources.index(name)], used, used)] += added[i]
+            self.C[self.sources.index(name)][np.ix_(used, used)] += added[i]
         if repeat > 1:
             return
         self.C = F[-1] @ self.C @ F[-1].T
@@ -758,9 +752,7 @@ class _Analysis:
             filtered = history["covariance"][:, 0]
         else:
             filtered = sigma[:, :, None] ** 2 * np.eye(sigma.shape[1])
-        sources = {
-            name: np.stack([each[name] for _, each in self.errors]) for name in self.sources
-        }
+        sources = {name: np.stack([each[name] for _, each in self.errors]) for name in self.sources}
         quantities = self.evaluation.quantities
         return LinearCovariance(
             self.evaluation_path,
@@ -776,23 +768,23 @@ def _dispersed_covariance(d: Dispersion, components: Any, nominal: FloatArray) -
     """Covariance of a dispersion's draw, for a parameter of the given nominal value."""
     spread = d.read_spread(components)
     shape = np.shape(nominal)
-    value = np.asarray(nominal, dtype=np.float64).reshape(-1)
+    value: FloatArray = np.asarray(nominal, dtype=np.float64).reshape(-1)
     if d.kind == "multivariate":
         return spread
     if d.kind == "list":
         flat = spread.reshape(len(spread), -1)
         found: FloatArray = np.atleast_2d(np.cov(flat.T, bias=True))
         return found
-    flat = np.broadcast_to(spread, shape).reshape(-1)
+    width = np.broadcast_to(spread, shape).reshape(-1)
     if d.kind == "normal":
-        return np.diag(flat**2)
+        return np.diag(width**2)
     if d.kind == "uniform":
-        return np.diag(flat**2 / 3)
+        return np.diag(width**2 / 3)
     if d.kind == "truncated":
         from scipy.stats import truncnorm
 
-        return np.diag(flat**2 * truncnorm.var(-d.limit, d.limit))
-    return np.diag((value * np.log(flat)) ** 2 / 3)  # to first order
+        return np.diag(width**2 * truncnorm.var(-d.limit, d.limit))
+    return np.diag((value * np.log(width)) ** 2 / 3)  # to first order
 
 
 def _directions(system: System, length: Any, result: LinearCovariance) -> list[Direction]:
@@ -805,8 +797,7 @@ def _directions(system: System, length: Any, result: LinearCovariance) -> list[D
             (
                 c.source.rpartition(".")[0]
                 for c in flat.connections
-                if c.target.rpartition(".")[0] == path
-                and flat.port(c.source).kind == "message"
+                if c.target.rpartition(".")[0] == path and flat.port(c.source).kind == "message"
             ),
             None,
         )

@@ -273,7 +273,8 @@ class Master:
 
         Nothing is done, and False returned, if that is only one tick, or not like the others.
         """
-        assert program.stretch is not None and group.next_tick is not None
+        assert program.stretch is not None
+        assert group.next_tick is not None
         first, spacing = group.next_tick, group.spacing
         last = min([end, *(later[0] - 1 for later in self._heap[1:3])])
         n_ticks = (last - first) // spacing + 1

@@ -225,7 +225,13 @@ def draw_panel(ax: Any, panel: Panel) -> dict[str, Any]:
         sample = 3 * (sample_sigma(panel.error) if panel.sample is None else panel.sample)
         handles["sample 3 sigma"] = _both_signs(ax, panel.times, sample, SAMPLE, (0, (4, 2)))
         mean = member_mean(panel.error) if panel.mean is None else panel.mean
-        (line,) = ax.plot(*_thinned(panel.times, mean[:, None]), color="black", linestyle="--", linewidth=1.0, zorder=4)
+        (line,) = ax.plot(
+            *_thinned(panel.times, mean[:, None]),
+            color="black",
+            linestyle="--",
+            linewidth=1.0,
+            zorder=4,
+        )
         handles["sample mean"] = line
         bounds.append(sample)
     _limit(ax, panel.times, bounds)

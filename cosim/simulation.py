@@ -24,6 +24,7 @@ from terrafix.cosim.identity import configuration, difference
 from terrafix.cosim.kernels import build_kernels
 from terrafix.cosim.master import Master
 from terrafix.cosim.parameters import Parameter
+from terrafix.cosim.ports import State
 from terrafix.cosim.record import Recorder, write_manifest
 from terrafix.cosim.symbolic import SymbolicComponent
 from terrafix.cosim.system import System
@@ -176,10 +177,10 @@ class Simulation:
             component.keep_kernel(kernel)
         kinds = set()
         for component in symbolic.values():
-            kernel = component.kept_kernel
-            assert kernel is not None
-            component.bind_kernel(kernel)
-            kinds.add(kernel.kind)
+            kept = component.kept_kernel
+            assert kept is not None
+            component.bind_kernel(kept)
+            kinds.add(kept.kind)
         return "+".join(sorted(kinds))
 
     def _make_recorders(self, *, recording: bool) -> list[Recorder]:
@@ -224,7 +225,9 @@ class Simulation:
                 if isinstance(declared, Parameter):
                     found[target] = (declared.unit_text(), component._settings[name].copy())
                 else:
-                    unit = component._declared[name].field.unit_text()
+                    state = component._declared[name]
+                    assert isinstance(state, State)
+                    unit = state.field.unit_text()
                     found[target] = (unit, component._states[name].copy())
         return found
 

@@ -108,9 +108,7 @@ class Stage:
         ]
         keys = [arrays.noise_keys[a.name] for a in kernel.noise]
         self.keys = np.array([*keys, 0], dtype=np.uint64)
-        self.clock = {
-            a.kind: arrays.arguments[a.name] for a in kernel.arguments if a.kind in CLOCK
-        }
+        self.clock = {a.kind: arrays.arguments[a.name] for a in kernel.arguments if a.kind in CLOCK}
 
 
 @cache
@@ -352,9 +350,12 @@ class Stretch:
     def _failures(self) -> list[Failure]:
         failed = self._failed.astype(np.bool_)
         self._failed[:] = 0
-        found = sorted({(int(t), int(s)) for t, s in zip(
-            self._failed_tick[failed], self._failed_stage[failed], strict=True
-        )})
+        found = sorted(
+            {
+                (int(t), int(s))
+                for t, s in zip(self._failed_tick[failed], self._failed_stage[failed], strict=True)
+            }
+        )
         return [
             Failure(t, s, failed & (self._failed_tick == t) & (self._failed_stage == s))
             for t, s in found

@@ -94,7 +94,14 @@ class Compiler:
         with tempfile.TemporaryDirectory(prefix="terrafix-") as directory:
             file, library = Path(directory, "kernel.c"), Path(directory, f"kernel{_SUFFIX}")
             file.write_text(source)
-            command = [*self.command, *self.options(native=native), str(file), "-o", str(library), "-lm"]
+            command = [
+                *self.command,
+                *self.options(native=native),
+                str(file),
+                "-o",
+                str(library),
+                "-lm",
+            ]
             try:
                 done = subprocess.run(
                     command, capture_output=True, text=True, errors="replace", check=False
@@ -135,7 +142,8 @@ def find_compiler() -> Compiler | None:
             return compiler
     if compilation_required():
         raise ConfigurationError(
-            f"TERRAFIX_KERNEL={wanted_kernel()} asks for compiled kernels, which cannot be had: {_why_none()}"
+            f"TERRAFIX_KERNEL={wanted_kernel()} asks for compiled kernels, which cannot be had: "
+            f"{_why_none()}"
         )
     return None
 

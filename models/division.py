@@ -38,7 +38,9 @@ def sharing_reciprocals(function: Any) -> Any:
     """
     code = [
         _Instruction(
-            function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+            function.instruction_id(k),
+            function.instruction_input(k),
+            function.instruction_output(k),
         )
         for k in range(function.n_instructions())
     ]
@@ -75,6 +77,7 @@ def _rewritten(
         if kind == ca.OP_OUTPUT:
             results[outputs[0]][outputs[1]] = register[inputs[0]]
             continue
+        value: Any
         if kind == ca.OP_INPUT:
             value = elements[inputs[0]][inputs[1]]
         elif kind == ca.OP_CONST:

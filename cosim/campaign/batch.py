@@ -151,9 +151,7 @@ def fly_batch(task: Task, first: int, last: int) -> list[BlockResult]:
 _Flight = tuple[Task, Simulation, NDArray[np.int64], dict[str, dict[str, NDArray[Any]]], Any, Any]
 
 
-def _fly(
-    task: Task, system: System, members: NDArray[np.int64], *, alone: bool = False
-) -> _Flight:
+def _fly(task: Task, system: System, members: NDArray[np.int64], *, alone: bool = False) -> _Flight:
     """Fly some members; histories by evaluation component, padded where nobody was left."""
     simulation = Simulation(
         system,
@@ -219,7 +217,7 @@ def _joined(parts: list[_Flight]) -> _Flight:
         for name, (unit, _) in parts[0][5].items()
     }
     members = np.concatenate([p[2] for p in parts])
-    return task, simulation, members, histories, sum((p[4] for p in parts), []), parameters
+    return task, simulation, members, histories, [e for p in parts for e in p[4]], parameters
 
 
 def _blocks(
@@ -261,7 +259,11 @@ def _write_histories(task: Task, simulation: Simulation, members: NDArray[np.int
     dataset = simulation.result(wall_s=0.0, status="part of a campaign").dataset
     for start in range(0, len(members), BLOCK):
         part = dataset.isel(member=slice(start, start + BLOCK))
-        part.attrs |= {"excluded": "", "evaluation": "", "members": str(members[start : start + BLOCK])}
+        part.attrs |= {
+            "excluded": "",
+            "evaluation": "",
+            "members": str(members[start : start + BLOCK]),
+        }
         write_netcdf(part, folder / f"{int(members[start]) // BLOCK:06d}.nc")
 
 

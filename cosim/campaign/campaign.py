@@ -348,9 +348,7 @@ def _batches(
     while start < len(missing):
         end = start + 1
         while (
-            end < len(missing)
-            and end - start < per_batch
-            and missing[end] == missing[end - 1] + 1
+            end < len(missing) and end - start < per_batch and missing[end] == missing[end - 1] + 1
         ):
             end += 1
         batches.append((missing[start] * BLOCK, min((missing[end - 1] + 1) * BLOCK, runs)))

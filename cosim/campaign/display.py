@@ -33,7 +33,7 @@ def campaign_tables(result: CampaignResult, system: str) -> list[Any]:
     header.append(f", {', '.join(facts)}", style="not bold")
     shown: list[Any] = [header]
     summary = result.summary()["evaluation"]
-    each = summary if len(result.statistics) > 1 else {path: summary for path in result.statistics}
+    each = summary if len(result.statistics) > 1 else dict.fromkeys(result.statistics, summary)
     for path, evaluation in each.items():
         if len(result.statistics) > 1:
             shown.append(Text(f"\n{path}", style="bold"))
@@ -68,8 +68,7 @@ def _table(evaluation: Mapping[str, Any]) -> Padding:
         for i, axis in enumerate(q["axes"]):
             low, high = q["ratio_interval_95"][i]
             values = [
-                q[k][i]
-                for k in ("mean_error", "standard_error", "sigma_sample", "sigma_predicted")
+                q[k][i] for k in ("mean_error", "standard_error", "sigma_sample", "sigma_predicted")
             ]
             table.add_row(
                 name if i == 0 else "",

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 from terrafix.cosim.campaign.batch import BlockResult, Task, fly_batch, single_threaded
@@ -84,7 +85,7 @@ def _count_loss(lost: dict[Batch, int], batch: Batch) -> None:
 @contextmanager
 def _cluster(address: str) -> Iterator[Any]:
     try:
-        from dask.distributed import Client, LocalCluster
+        distributed: Any = import_module("distributed")
     except ImportError:
         raise ConfigurationError(
             "a campaign on Dask needs the package 'distributed'\n"
@@ -95,19 +96,19 @@ def _cluster(address: str) -> Iterator[Any]:
         if not count.isdigit() or int(count) < 1:
             raise ConfigurationError(f"'{address}' names no number of workers; write local:2")
         with (
-            LocalCluster(
+            distributed.LocalCluster(
                 n_workers=int(count),
                 threads_per_worker=1,
                 processes=True,
                 dashboard_address=None,
                 silence_logs=50,
             ) as cluster,
-            Client(cluster) as client,
+            distributed.Client(cluster) as client,
         ):
             yield client
         return
     try:
-        client = Client(address, timeout=CONNECT_SECONDS)
+        client = distributed.Client(address, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:
         raise ConfigurationError(
             f"there is no Dask scheduler at '{address}': {error}\n"
@@ -129,9 +130,7 @@ def on_dask(
     `started` is called with the client once the cluster is there.
     """
     with _cluster(address) as client:
-        from dask.distributed import as_completed
-        from distributed.scheduler import KilledWorker
-
+        distributed: Any = import_module("distributed")
         if started is not None:
             started(client)
         workers = client.scheduler_info(n_workers=-1)["workers"]
@@ -139,7 +138,7 @@ def on_dask(
         waiting = list(batches)[::-1]
         lost: dict[Batch, int] = {}
         batch_of: dict[str, Batch] = {}
-        queue = as_completed()
+        queue = distributed.as_completed()
 
         def submit() -> None:
             batch = waiting.pop()
@@ -153,7 +152,7 @@ def on_dask(
             batch = batch_of.pop(future.key)
             try:
                 results = future.result()
-            except KilledWorker:
+            except distributed.KilledWorker:
                 _count_loss(lost, batch)
                 waiting.append(batch)
             else:

@@ -31,7 +31,8 @@ def ratio_interval(n: int, probability: float = 0.95) -> tuple[float, float]:
 
 def _plain(values: Any) -> Any:
     return [
-        _plain(v) if np.ndim(v) else (float(v) if np.isfinite(v) else None) for v in np.asarray(values)
+        _plain(v) if np.ndim(v) else (float(v) if np.isfinite(v) else None)
+        for v in np.asarray(values)
     ]
 
 
@@ -129,7 +130,7 @@ def summary_of(result: CampaignResult) -> dict[str, Any]:
 
 
 def build_result(result: CampaignResult) -> xarray.Dataset:
-    """Statistics as labeled arrays; names begin with the component's path where there are several."""
+    """Statistics as labeled arrays; names begin with the path where there are several."""
     import xarray
 
     variables: dict[str, Any] = {}

@@ -100,7 +100,7 @@ def block_of(layout: Layout, history: Mapping[str, NDArray[Any]], *, first: int)
     """
     error = _side_by_side(layout, history, "error")
     sigma = _side_by_side(layout, history, "sigma")
-    valid = np.isfinite(error).all(axis=2)
+    valid: NDArray[np.bool_] = np.asarray(np.isfinite(error).all(axis=2))
     n = valid.sum(axis=1)
     filled = np.where(valid[:, :, None], error, 0.0)
     divisor = np.maximum(n, 1)[:, None]
@@ -198,10 +198,11 @@ def _histogram(z: FloatArray) -> NDArray[np.uint8]:
     return counts.reshape(n_epochs, n_axes, BINS).astype(np.uint8)
 
 
-_ADDED = (
-    "predicted nees_sum nees_n nis_sum nis_n dof innovation_sum innovation_square innovation_n "
-    "lag_product lag_square lag_n"
-).split()
+_ADDED = [
+    *("predicted", "nees_sum", "nees_n", "nis_sum", "nis_n", "dof"),
+    *("innovation_sum", "innovation_square", "innovation_n"),
+    *("lag_product", "lag_square", "lag_n"),
+]
 _JOINED = {"shown_error": 1, "shown_sigma": 1, "shown_nees": 1}
 
 

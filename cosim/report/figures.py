@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,12 +38,12 @@ def figures(
     """
     found: dict[str, Callable[[], Any]] = {}
     for quantity in quantities(dataset):
-        found[f"{quantity}_error"] = lambda q=quantity: _error_figure(dataset, q, prediction)
+        found[f"{quantity}_error"] = partial(_error_figure, dataset, quantity, prediction)
     for name in ("nees", "nis"):
         if name in dataset and np.isfinite(dataset[name].values).any():
-            found[name] = lambda n=name: _consistency_figure(dataset, n)
+            found[name] = partial(_consistency_figure, dataset, name)
     if prediction is not None and prediction.sources:
-        found["error_budget"] = lambda: _budget_figure(prediction)
+        found["error_budget"] = partial(_budget_figure, prediction)
     return found
 
 
@@ -106,7 +107,9 @@ def _error_figure(
     times = dataset["time"].values
     drawn = Figure(figsize=(7.2, 0.9 + 1.7 * len(axes)), layout="constrained")
     handles: dict[str, Any] = {}
-    for ax, i in zip(drawn.subplots(len(axes), 1, sharex=True, squeeze=False)[:, 0], axes, strict=True):
+    for ax, i in zip(
+        drawn.subplots(len(axes), 1, sharex=True, squeeze=False)[:, 0], axes, strict=True
+    ):
         unit, factor = shown_unit(str(dataset["unit"].values[i]))
         panel = Panel(
             quantity,
@@ -157,13 +160,13 @@ def _consistency_figure(dataset: xarray.Dataset, name: str) -> Any:
     low, high = dataset[f"{name}_low"].values[given], dataset[f"{name}_high"].values[given]
     drawn = Figure(figsize=(7.2, 2.6), layout="constrained")
     ax = drawn.subplots()
-    handles = {
+    handles: dict[str, Any] = {
         "95 % interval if consistent": ax.fill_between(
             times, low, high, color="0.86", linewidth=0, step="mid"
         )
     }
     (handles["expected"],) = ax.plot(times, 0.5 * (low + high), color="0.5", linewidth=0.8)
-    style = {"marker": ".", "markersize": 4, "linewidth": 0.9, "color": PREDICTED}
+    style: dict[str, Any] = {"marker": ".", "markersize": 4, "linewidth": 0.9, "color": PREDICTED}
     (handles["mean over the runs"],) = ax.plot(times, mean, **style)
     top = max(float(np.nanmax(high)), float(np.nanquantile(mean, 0.98)))
     bottom = min(float(np.nanmin(low)), float(np.nanquantile(mean, 0.02)))
@@ -195,7 +198,7 @@ def _budget_figure(prediction: LinearCovariance) -> Any:
     ax = drawn.subplots()
     left = np.zeros(len(total))
     y = np.arange(len(total))[::-1]
-    handles = {}
+    handles: dict[str, Any] = {}
     for k, name in enumerate(names):
         part = np.where(total > 0, budget[name] ** 2 / np.where(total > 0, total, 1.0), 0.0)
         handles[name] = ax.barh(y, 100 * part, left=left, color=f"C{k}", height=0.7)

@@ -157,9 +157,7 @@ def _evaluation(campaign: Campaign, path: str) -> Iterator[str]:
         yield from _directions(prediction)
 
 
-def _end_table(
-    evaluation: Mapping[str, Any], prediction: LinearCovariance | None
-) -> Iterator[str]:
+def _end_table(evaluation: Mapping[str, Any], prediction: LinearCovariance | None) -> Iterator[str]:
     heads = ["quantity", "axis", "unit", "mean error", "standard error", "sample sigma"]
     heads += ["predicted sigma", "ratio", "95 % interval"]
     heads += ["linear covariance"] if prediction is not None else []

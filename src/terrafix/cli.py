@@ -456,8 +456,8 @@ def _one_member(
     out: str | None,
     as_json: bool,
 ) -> int:
-    from terrafix.cosim.tables import result_tables
     from terrafix.cosim.run import simulate
+    from terrafix.cosim.tables import result_tables
 
     if member >= runs:
         raise ConfigurationError(

@@ -89,7 +89,10 @@ def test_dispersions_of_nested_systems_take_its_path(toys):
     ("dispersion", "text"),
     [
         (Dispersion("d", ("efk.start",), 1), r"no component 'efk'\n  did you mean 'ekf'\?"),
-        (Dispersion("d", ("ekf.x",), 1), "no numeric parameter\n  numeric parameters: position, start"),
+        (
+            Dispersion("d", ("ekf.x",), 1),
+            "no numeric parameter\n  numeric parameters: position, start",
+        ),
         (Dispersion("d", (), 1), "feeds no parameter"),
         (Dispersion("d", ("ekf.start",), -1), "must be at least 0"),
         (Dispersion("d", ("ekf.start",), "1 s"), "the units differ: s is not m"),
