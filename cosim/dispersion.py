@@ -358,7 +358,7 @@ def _design(design: str, dimensions: int, seed: int, runs: int) -> FloatArray:
     """Uniform numbers of all runs, shape (runs, dimensions), inside (0, 1)."""
     from scipy.stats import qmc
 
-    generator = np.random.Generator(np.random.Philox(key=stream_key(seed, "dispersion", design)))
+    generator = np.random.default_rng(stream_key(seed, "dispersion", design))
     if design == "latin_hypercube":
         rows = qmc.LatinHypercube(dimensions, seed=generator).random(runs)
     else:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -22,7 +24,7 @@ Batch = tuple[int, int]
 """First member, and the one after the last."""
 Flown = Iterator[list[BlockResult]]
 MOST_LOSSES = 3
-CONNECT_SECONDS = 10
+CONNECT_SECONDS = 5
 
 
 def processors() -> int:
@@ -52,7 +54,7 @@ def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown
     lost: dict[Batch, int] = {}
     while waiting:
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, context, initializer=single_threaded)
+        pool = ProcessPoolExecutor(workers, context, initializer=_begin_worker)
         running: dict[Any, Batch] = {}
         try:
             while waiting or running:
@@ -71,6 +73,20 @@ def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown
             pool.shutdown(wait=False, cancel_futures=True)
             for process in list((pool._processes or {}).values()):
                 process.terminate()
+
+
+def _begin_worker() -> None:
+    """Leave Ctrl-C to the campaign's process, and end when it ends, however it does."""
+    single_threaded()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_follow, args=(parent,), daemon=True).start()
+
+
+def _follow(parent: Any) -> None:
+    parent.join()
+    os._exit(1)
 
 
 def _count_loss(lost: dict[Batch, int], batch: Batch) -> None:
