@@ -41,6 +41,7 @@ campaigns: $(STAMP)
 ## the promised numbers, as ratios against a reference in the same run
 benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/run.py
+	$(BIN)/python benchmarks/campaign.py
 	$(BIN)/python benchmarks/fmu.py
 	$(BIN)/python benchmarks/imaging.py
 	$(BIN)/python benchmarks/closed_loop.py

@@ -64,6 +64,7 @@ STRUCTURE = {
     "predict.gravity": "j2",
     "predict.transition": "exact",
     "correct.update": "ekf",
+    "correct.jacobian": "exact",
     "correct.in_track": "speed",
 }
 # Every error source that the example leaves at zero
