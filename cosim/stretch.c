@@ -22,7 +22,7 @@ EXPORT const char terrafix_key[] = TERRAFIX_KEY;
  * member (0: the same for all), at `offset` doubles of the tile's. */
 struct array {
     char *base;
-    int64_t stride, size, offset, written;
+    int64_t stride, size, offset, read, written;
 };
 
 /* One kernel; laid out, as the others, as in cosim/stretch.py. Offsets are in doubles of the
@@ -133,7 +133,8 @@ static uint32_t fly_tile(const struct stretch *s, double *tile, const uint64_t *
 {
     uint32_t flying = chosen;
     for (int64_t i = 0; i < s->n_arrays; i++)
-        gather(&s->arrays[i], s->lanes, start, count, tile);
+        if (s->arrays[i].read || complete)
+            gather(&s->arrays[i], s->lanes, start, count, tile);
     for (int64_t lane = 0; lane < s->lanes; lane++)
         tile[s->dt_at + lane] = s->dt;
     for (int64_t k = 0; k < s->n_stages; k++) {
@@ -143,7 +144,7 @@ static uint32_t fly_tile(const struct stretch *s, double *tile, const uint64_t *
     for (int64_t j = 0; j < s->n_ticks && flying; j++) {
         int last = j == s->n_ticks - 1;
         uint32_t failed = fly_tick(s, tile, identity, start, j, complete || last, flying);
-        if (failed && !complete && s->n_ticks > 1)
+        if (failed && !complete)
             return fly_tile(s, tile, identity, start, count, chosen, 1);
         flying &= ~failed;
     }

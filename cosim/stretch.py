@@ -34,6 +34,7 @@ class _Array(ctypes.Structure):
         ("stride", ctypes.c_int64),
         ("size", ctypes.c_int64),
         ("offset", ctypes.c_int64),
+        ("read", ctypes.c_int64),
         ("written", ctypes.c_int64),
     )
 
@@ -177,6 +178,7 @@ class Stretch:
                     0 if len(rows) == 1 else rows.strides[0],
                     rows.shape[1],
                     self._places[key],
+                    key in self._read,
                     key in self._written,
                 )
                 for key, rows in self._rows.items()

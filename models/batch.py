@@ -71,20 +71,50 @@ def over_members(expression: Callable[..., Any], *shapes: Shape) -> Callable[...
             *(a.shape[: a.ndim - len(shape)] for a, shape in zip(given, shapes, strict=True))
         )
         n = prod(leading)
-        columns = [
-            np.broadcast_to(a, leading + shape).reshape(n, prod(shape)).T
+        rows = [
+            np.ascontiguousarray(np.broadcast_to(a, leading + shape).reshape(n, prod(shape)))
             for a, shape in zip(given, shapes, strict=True)
         ]
-        raw = (
-            function.call([ca.DM(c) for c in columns]) if n else [ca.DM(0, 0)] * len(result_shapes)
-        )
+        flat = _evaluated(function, rows, [prod(shape) for shape in result_shapes], n)
         results = tuple(
-            np.ascontiguousarray(r.full().T).reshape(leading + shape)
-            for r, shape in zip(raw, result_shapes, strict=True)
+            r.reshape(leading + shape) for r, shape in zip(flat, result_shapes, strict=True)
         )
         return results if several else results[0]
 
     return evaluate
+
+
+_asked: dict[tuple[int, int], Any] = {}
+_MOST_MAPS = 64
+
+
+def _evaluated(function: Any, rows: list[Any], sizes: list[int], n: int) -> list[Any]:
+    """Rows of results (n, size) from rows of arguments.
+
+    A number of members that was asked for before gets a function of its own, which reads and
+    writes the rows where they lie; making one takes longer than a single evaluation.
+    """
+    if not n:
+        return [np.empty((0, size)) for size in sizes]
+    key = (id(function), n)
+    if key not in _asked:
+        if len(_asked) >= _MOST_MAPS:
+            _asked.clear()
+        _asked[key] = None
+        raw = function.call([ca.DM(r.T) for r in rows])
+        return [np.ascontiguousarray(r.full().T) for r in raw]
+    if _asked[key] is None:
+        _asked[key] = function.map(n)
+    results = [np.empty((n, size)) for size in sizes]
+    buffer, evaluate = _asked[key].buffer()
+    for i, row in enumerate(rows):
+        buffer.set_arg(i, memoryview(row.reshape(-1)))
+    for i, result in enumerate(results):
+        buffer.set_res(i, memoryview(result.reshape(-1)))
+    evaluate()
+    if buffer.ret():
+        raise ValueError(f"'{function.name()}' failed")
+    return results
 
 
 def _numpy_shape(expression: Any) -> Shape:

@@ -54,27 +54,27 @@ def normalized_square(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
     safe_e = np.where(valid[..., None], e, 0.0)
     # scale to unit diagonal: the elements have different units
     sigma = np.sqrt(np.diagonal(safe_P, axis1=-2, axis2=-1))
-    P = safe_P / (sigma[..., :, None] * sigma[..., None, :])
-    e = safe_e / sigma
+    # axes first: the members of an element side by side
+    P = np.ascontiguousarray(
+        np.moveaxis(safe_P / (sigma[..., :, None] * sigma[..., None, :]), (-2, -1), (0, 1))
+    )
+    e = np.ascontiguousarray(np.moveaxis(safe_e / sigma, -1, 0))
     L = np.zeros_like(P)
     whitened = np.zeros_like(e)
-    total = np.zeros(e.shape[:-1])
+    total = np.zeros(e.shape[1:])
     for j in range(n):
-        pivot = P[..., j, j].copy()
+        below = P[j:, j].copy()  # of the pivot and all rows under it
+        remaining = e[j].copy()
         for k in range(j):
-            pivot -= L[..., j, k] * L[..., j, k]
+            below -= L[j:, k] * L[j, k]
+            remaining -= L[j, k] * whitened[k]
+        pivot = below[0]
         valid &= pivot > 0
-        L[..., j, j] = np.sqrt(np.where(pivot > 0, pivot, 1.0))
-        remaining = e[..., j].copy()
-        for k in range(j):
-            remaining -= L[..., j, k] * whitened[..., k]
-        whitened[..., j] = remaining / L[..., j, j]
-        total += whitened[..., j] * whitened[..., j]
-        for i in range(j + 1, n):
-            below = P[..., i, j].copy()
-            for k in range(j):
-                below -= L[..., i, k] * L[..., j, k]
-            L[..., i, j] = below / L[..., j, j]
+        root = np.sqrt(np.where(pivot > 0, pivot, 1.0))
+        L[j, j] = root
+        L[j + 1 :, j] = below[1:] / root
+        whitened[j] = remaining / root
+        total += whitened[j] * whitened[j]
     return np.where(valid, total, np.nan)
 
 

@@ -201,6 +201,7 @@ def test_noise_goes_where_it_belongs(start_e):
         start_e,
         range_sigma=2.0,
         speed_sigma=0.5,
+        error_scale=1.0,
         geolocation_sigma=[8, 5, 2],
         geolocation_bias=[1, 2, 3],
         range_noise=1.5,
