@@ -269,14 +269,16 @@ class Master:
             return None
 
     def _fly(self, program: _Program, group: _Group, number: int, end: int) -> bool:
-        """Step a group's ticks from its next one on, before `end` and anybody else's, at once.
+        """Step a group's ticks from its next one on, up to `end` and before anybody else's.
 
         Nothing is done, and False returned, if that is only one tick, or not like the others.
         """
         assert program.stretch is not None
         assert group.next_tick is not None
         first, spacing = group.next_tick, group.spacing
-        last = min([end, *(later[0] - 1 for later in self._heap[1:3])])
+        # recorders look on once the others have stepped: a stretch may end at their tick
+        others = (tick - (self._groups[i].sample is None) for tick, i in self._heap if i != number)
+        last = min(end, *others) if len(self._heap) > 1 else end
         n_ticks = (last - first) // spacing + 1
         if n_ticks < 2 or first - group.tick != spacing or last * self._numerator > 2**53:
             return False

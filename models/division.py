@@ -101,5 +101,4 @@ def _rewritten(
         [ca.vertcat(*r) if r else ca.SX(0, 1) for r in results],
         [function.name_in(i) for i in range(function.n_in())],
         [function.name_out(i) for i in range(function.n_out())],
-        {"cse": True},
     )
