@@ -105,7 +105,7 @@ def _evaluated(function: Any, rows: list[Any], sizes: list[int], n: int) -> list
         return [np.ascontiguousarray(r.full().T) for r in raw]
     if _asked[key] is None:
         _asked[key] = function.map(n)
-    results = [np.empty((n, size)) for size in sizes]
+    results: list[Any] = [np.empty((n, size)) for size in sizes]
     buffer, evaluate = _asked[key].buffer()
     for i, row in enumerate(rows):
         buffer.set_arg(i, memoryview(row.reshape(-1)))

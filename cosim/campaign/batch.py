@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,8 @@ class Task:
         [s]
     histories : str or None
         Folder for full records, one NetCDF file per block.
+    key : str
+        Unlike that of any other campaign.
     """
 
     source: FileSource | System
@@ -64,6 +66,7 @@ class Task:
     seed: int
     duration: Fraction
     histories: str | None = None
+    key: str = field(default_factory=lambda: uuid4().hex)
 
 
 @dataclass
@@ -89,10 +92,16 @@ class BlockResult:
     kernel: str
 
 
-@lru_cache(maxsize=2)
-def _system(source: FileSource | System) -> System:
+_systems: dict[str, System] = {}
+
+
+def _system(task: Task) -> System:
     """The system, read once in each process: its models and kernels are kept."""
-    return source.read() if isinstance(source, FileSource) else source
+    if task.key not in _systems:
+        _systems.clear()
+        source = task.source
+        _systems[task.key] = source.read() if isinstance(source, FileSource) else source
+    return _systems[task.key]
 
 
 def layouts(simulation: Simulation, duration: Fraction) -> dict[str, Layout]:
@@ -138,7 +147,7 @@ def fly_batch(task: Task, first: int, last: int) -> list[BlockResult]:
     StepError
         If a component fails for every member by itself.
     """
-    system = _system(task.source)
+    system = _system(task)
     members = np.arange(first, last)
     try:
         return _blocks(*_fly(task, system, members))

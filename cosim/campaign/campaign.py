@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -169,6 +169,8 @@ def run_campaign(
     """
     began = time.perf_counter()
     _check_numbers(runs, workers, batch, resume=resume, out=out, histories=histories)
+    if isinstance(source, FileSource):  # workers may stand elsewhere
+        source = replace(source, path=str(Path(source.path).absolute()))
     system = source.read() if isinstance(source, FileSource) else source
     length = system.duration if duration is None else seconds(duration, "duration")
     if length is None or length <= 0:
@@ -242,7 +244,7 @@ def _described(source: FileSource | System) -> dict[str, Any]:
     """Where the system was read from, for reports that read it again."""
     if isinstance(source, System):
         return {}
-    return {"path": str(Path(source.path).absolute()), "settings": [*map(list, source.settings)]}
+    return {"path": source.path, "settings": [*map(list, source.settings)]}
 
 
 def _drawn(system: System) -> str:
@@ -307,6 +309,7 @@ def _fly(
                 progress("flying", merged / n_blocks)
 
     merge()
+    result.workers = "nobody: all blocks were there"
     while merged < n_blocks:
         missing = [b for b in range(merged, n_blocks) if b not in ready]
         batches = _batches(missing, size, result.runs, workers, dask)
@@ -323,7 +326,9 @@ def _fly(
         except KeyboardInterrupt as error:
             raise CampaignError(_kept("interrupted", n_done, n_blocks, result)) from error
         except TerrafixError as error:
-            if merged == 0 and not done and isinstance(error, ConfigurationError):
+            if n_done == 0 and isinstance(error, ConfigurationError):
+                if store is not None:
+                    store.forget()
                 raise
             raise CampaignError(_kept(str(error), n_done, n_blocks, result)) from error
         finally:

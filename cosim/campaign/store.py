@@ -12,6 +12,7 @@ Each file is written whole or not at all, so a campaign killed at any moment can
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -107,6 +108,14 @@ class Store:
                 f"'{self.folder}' holds a campaign of another {key}: {other!r} there, {mine!r} "
                 "here\n  give another --out, or what it was begun with"
             )
+
+    def forget(self) -> None:
+        """Remove what was begun, nothing having been flown."""
+        if not self.done():
+            (self.folder / MANIFEST).unlink(missing_ok=True)
+            for each in (self._blocks, self.folder):
+                with suppress(OSError):
+                    each.rmdir()
 
     def close(self) -> None:
         """Give the folder back."""

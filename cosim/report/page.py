@@ -103,7 +103,7 @@ def _facts(campaign: Campaign) -> Iterator[str]:
             ("root seed", a["seed"]),
             ("duration", a["duration"]),
             ("time", f"{a['wall_s']:.2f} s, set up in {a['setup_s']:.2f} s"),
-            ("flown by", a["workers"] or "nothing: all blocks were there"),
+            ("flown by", a["workers"]),
             ("kernels", a["kernel"]),
             ("processor", a["cpu"]),
             ("versions", ", ".join(f"{k} {v}" for k, v in versions.items())),

@@ -103,8 +103,9 @@ SYSTEM_MISTAKES = {
         'speed_sigma = "0.54 m/s"',
         'beamwidth = "1 deg"',
         "ConfigurationError: 'sar' has no parameter 'beamwidth'\n"
-        "  its parameters: boresight, flattening, geolocation_bias, geolocation_sigma, in_track, "
-        "look, offset, period, radius, range_sigma, rate, speed_sigma, squint, times",
+        "  its parameters: boresight, error_scale, flattening, geolocation_bias, "
+        "geolocation_sigma, in_track, look, offset, period, radius, range_sigma, rate, "
+        "speed_sigma, squint, times",
     ),
     "misspelled parameter": edit(
         'gravity = "j2"',
@@ -603,7 +604,8 @@ SYSTEM_MISTAKES = {
     ),
     "dispersion of unknown kind": append(
         DISPERSION + 'kind = "gaussian"\n',
-        "ConfigurationError: dispersion 'start' is of kind 'gaussian'; it takes normal or uniform",
+        "ConfigurationError: dispersion 'start' is of kind 'gaussian'\n"
+        "  kinds: list, log_uniform, multivariate, normal, truncated, uniform",
     ),
     "uniform dispersion with a sigma": append(
         DISPERSION + 'kind = "uniform"\n',

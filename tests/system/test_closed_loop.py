@@ -110,7 +110,11 @@ def system_without_images(real):
 
 @pytest.mark.parametrize(
     ("kind", "expected"),
-    [("MirroredReference", "matcher"), ("OtherPlace", "matcher"), ("MisplacedReference", "filter")],
+    [
+        pytest.param("MirroredReference", "matcher", marks=pytest.mark.campaign),
+        pytest.param("OtherPlace", "matcher", marks=pytest.mark.campaign),
+        ("MisplacedReference", "filter"),
+    ],
 )
 def test_references_that_must_not_be_believed_are_not(real, kind, expected):
     """A mirror image and another place are not recognized; a false geocoding meets the gate."""
