@@ -56,6 +56,7 @@ struct stretch {
     double dt, t; /* length of every step; time at the first tick */
     int64_t tick, spacing, n_ticks; /* the first tick, from one to the next, and how many */
     int64_t numerator, denominator; /* seconds per tick */
+    int64_t n_tiles, next_tile;     /* the tile that the next thread without one takes */
 };
 
 static void gather(const struct array *a, int64_t lanes, int64_t first, int64_t count, double *tile)
@@ -154,11 +155,11 @@ static uint32_t fly_tile(const struct stretch *s, double *tile, const uint64_t *
     return chosen & ~flying;
 }
 
-/* Fly the tiles from `first` up to `last`, in scratch memory `tile` of this call alone. Returns
- * how many members failed. */
-EXPORT int64_t terrafix_stretch(const struct stretch *s, int64_t first, int64_t last, double *tile)
+/* Fly tiles that no other thread has taken until there are none, in scratch memory `tile` of this
+ * call alone. Returns how many members failed. */
+EXPORT int64_t terrafix_stretch(struct stretch *s, double *tile)
 {
-    int64_t lanes = s->lanes, n_failed = 0;
+    int64_t lanes = s->lanes, n_failed = 0, number;
     for (int64_t k = 0; k < s->n_stages; k++) {
         const struct stage *stage = &s->stages[k];
         void **pointer = (void **)(tile + stage->pointers);
@@ -169,7 +170,7 @@ EXPORT int64_t terrafix_stretch(const struct stretch *s, int64_t first, int64_t 
         for (int64_t i = 0; i < stage->n_noise; i++)
             *pointer++ = tile + stage->argument[stage->noise_argument[i]];
     }
-    for (int64_t number = first; number < last; number++) {
+    while ((number = __atomic_fetch_add(&s->next_tile, 1, __ATOMIC_RELAXED)) < s->n_tiles) {
         int64_t start = number * lanes, count = s->n_members - start;
         uint64_t identity[MOST_LANES] __attribute__((aligned(8 * MOST_LANES)));
         uint32_t chosen = 0, failed;

@@ -82,6 +82,8 @@ class _Stretch(ctypes.Structure):
         ("n_ticks", ctypes.c_int64),
         ("numerator", ctypes.c_int64),
         ("denominator", ctypes.c_int64),
+        ("n_tiles", ctypes.c_int64),
+        ("next_tile", ctypes.c_int64),
     )
 
 
@@ -117,7 +119,7 @@ def _driver() -> Any:
     source = Path(__file__).with_name("stretch.c").read_text()
     function = toolchain.load(source)["terrafix_stretch"]
     function.restype = ctypes.c_int64
-    function.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
+    function.argtypes = (ctypes.c_void_p, ctypes.c_void_p)
     return function
 
 
@@ -208,11 +210,8 @@ class Stretch:
         self._at = ctypes.addressof(self._call)
         n_tiles = -(-self._n_members // self._lanes)
         n_parts = 1 if single else max(1, min(available_threads(), n_tiles // _TILES_PER_THREAD))
-        ends = [n_tiles * (i + 1) // n_parts for i in range(n_parts)]
-        self._parts = [
-            (first_tile, end, self._scratch())
-            for first_tile, end in zip([0, *ends[:-1]], ends, strict=True)
-        ]
+        self._call.n_tiles = n_tiles
+        self._scratches = [self._scratch() for _ in range(n_parts)]
         self._fly = _driver()
 
     def _room(self, vectors: int) -> int:
@@ -301,8 +300,8 @@ class Stretch:
         call.t = t
         call.dt = dt
         call.n_ticks = 1
-        first, last, (_, scratch) = self._parts[0]
-        failed: int = self._fly(self._at, first, last, scratch)
+        call.next_tile = 0
+        failed: int = self._fly(self._at, self._scratches[0][1])
         return failed
 
     def fly(
@@ -336,17 +335,13 @@ class Stretch:
         call.dt = dt
         call.tick, call.spacing, call.n_ticks = tick, spacing, n_ticks
         call.numerator, call.denominator = numerator, denominator
-        if len(self._parts) == 1:
-            first, last, (_, scratch) = self._parts[0]
-            n_failed = self._fly(self._at, first, last, scratch)
-        else:
-            others = [
-                _pool().submit(self._fly, self._at, first, last, scratch)
-                for first, last, (_, scratch) in self._parts[1:]
-            ]
-            first, last, (_, scratch) = self._parts[0]
-            n_failed = self._fly(self._at, first, last, scratch)
-            n_failed += sum(other.result() for other in others)
+        call.next_tile = 0
+        others = [
+            _pool().submit(self._fly, self._at, scratch) for _, scratch in self._scratches[1:]
+        ]
+        n_failed = self._fly(self._at, self._scratches[0][1])
+        # one that has not begun by now would find nothing to do
+        n_failed += sum(other.result() for other in others if not other.cancel())
         return self._failures() if n_failed else []
 
     def _failures(self) -> list[Failure]:

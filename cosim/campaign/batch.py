@@ -6,6 +6,7 @@ and returns blocks; two batches know nothing of one another.
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -149,6 +150,7 @@ def fly_batch(task: Task, first: int, last: int) -> list[BlockResult]:
     """
     system = _system(task)
     members = np.arange(first, last)
+    gc.collect()  # what earlier batches left in cycles: memory must not grow with their number
     try:
         return _blocks(*_fly(task, system, members))
     except StepError:

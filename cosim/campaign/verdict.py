@@ -1,12 +1,12 @@
 r"""What the statistics say of a filter: consistent, overconfident, conservative, biased.
 
 Each statement is a test of a null hypothesis that leaves room for what no engineer would call
-wrong: a mean error within a tenth of a sigma, a sigma within five percent, a correlation within
-0.05. With :math:`N` members, :math:`d` axes, mean error :math:`\bar e`, sample covariance
+wrong, five percent of the root mean square error in any direction: a sigma within five percent, a
+mean error within :math:`\sqrt{1.05^2 - 1} = 0.32` sigma; and a correlation within 0.05. With :math:`N` members, :math:`d` axes, mean error :math:`\bar e`, sample covariance
 :math:`S` and predicted covariance :math:`P` at an epoch:
 
 - bias: :math:`\frac{N - d}{d (N - 1)} N \bar e^T S^{-1} \bar e` is :math:`F_{d, N - d}` with
-  noncentrality :math:`0.1^2 N` at most (Hotelling);
+  noncentrality :math:`(1.05^2 - 1) N` at most (Hotelling);
 - spread: :math:`(N - 1)\, \mathrm{tr}(P^{-1} S)` is :math:`\chi^2_{d (N - 1)}`, and for each axis
   :math:`(N - 1)\, S_{ii} / P_{ii}` is :math:`\chi^2_{N - 1}`, each times :math:`1.05^2` or
   :math:`0.95^2` at most;
@@ -29,8 +29,8 @@ import numpy as np
 from terrafix.cosim.campaign.statistics import FloatArray, Statistics
 
 LEVEL = 0.01
-BIAS_TOLERANCE = 0.1
 SIGMA_TOLERANCE = 0.05
+BIAS_TOLERANCE = ((1 + SIGMA_TOLERANCE) ** 2 - 1) ** 0.5
 CORRELATION_TOLERANCE = 0.05
 FAMILIES = ("bias", "spread", "spread of an axis", "NIS", "whiteness")
 
