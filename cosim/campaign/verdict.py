@@ -2,8 +2,9 @@ r"""What the statistics say of a filter: consistent, overconfident, conservative
 
 Each statement is a test of a null hypothesis that leaves room for what no engineer would call
 wrong, five percent of the root mean square error in any direction: a sigma within five percent, a
-mean error within :math:`\sqrt{1.05^2 - 1} = 0.32` sigma; and a correlation within 0.05. With :math:`N` members, :math:`d` axes, mean error :math:`\bar e`, sample covariance
-:math:`S` and predicted covariance :math:`P` at an epoch:
+mean error within :math:`\sqrt{1.05^2 - 1} = 0.32` sigma; and a correlation within 0.05. With
+:math:`N` members, :math:`d` axes, mean error :math:`\bar e`, sample covariance :math:`S` and
+predicted covariance :math:`P` at an epoch:
 
 - bias: :math:`\frac{N - d}{d (N - 1)} N \bar e^T S^{-1} \bar e` is :math:`F_{d, N - d}` with
   noncentrality :math:`(1.05^2 - 1) N` at most (Hotelling);
