@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 from terrafix.cosim.campaign.batch import BlockResult, Task, fly_batch, single_threaded
@@ -52,6 +55,7 @@ def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown
     """Fly batches in processes of their own."""
     waiting = list(batches)[::-1]
     lost: dict[Batch, int] = {}
+    alone = b"__main__" not in pickle.dumps(task)
     while waiting:
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(workers, context, initializer=_begin_worker)
@@ -60,7 +64,8 @@ def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown
             while waiting or running:
                 while waiting and len(running) < workers + 1:
                     batch = waiting.pop()
-                    running[pool.submit(fly_batch, task, *batch)] = batch
+                    with _without_main(hidden=alone):  # this is when processes are started
+                        running[pool.submit(fly_batch, task, *batch)] = batch
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     yield future.result()
                     del running[future]
@@ -73,6 +78,18 @@ def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown
             pool.shutdown(wait=False, cancel_futures=True)
             for process in list((pool._processes or {}).values()):
                 process.terminate()
+
+
+@contextmanager
+def _without_main(*, hidden: bool) -> Iterator[None]:
+    """Keep new processes from running the user's script once more, which may fly a campaign."""
+    main = sys.modules["__main__"]
+    if hidden:
+        sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _begin_worker() -> None:
@@ -94,7 +111,8 @@ def _count_loss(lost: dict[Batch, int], batch: Batch) -> None:
     if lost[batch] > MOST_LOSSES:
         raise StepError(
             f"the worker that flew members {batch[0]} to {batch[1] - 1} was lost "
-            f"{lost[batch]} times\n  it may need more memory than there is: give fewer --workers"
+            f"{lost[batch]} times\n  it may need more memory than there is: give fewer workers; in "
+            "a script that\n  defines components, fly below `if __name__ == '__main__':`"
         )
 
 

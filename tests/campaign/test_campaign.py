@@ -419,6 +419,29 @@ def test_control_c_says_what_is_kept_and_how_to_go_on(line, tmp_path):
     assert "complete them with --out c --resume" in err
 
 
+def test_a_script_needs_no_guard(tmp_path, whole):
+    """Workers do not run the script again; nor one that comes from standard input."""
+    search = os.pathsep.join([str(Path(__file__).parent), str(plugin(tmp_path))])
+    (tmp_path / "scalar.toml").write_text(SYSTEM)
+    script = (
+        "from terrafix.cosim.campaign.batch import FileSource\n"
+        "from terrafix.cosim.campaign.campaign import run_campaign\n"
+        "r = run_campaign(FileSource('scalar.toml'), runs=300, workers=2, batch=64)\n"
+        "print(r.workers, r.n_excluded)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-"],
+        input=script,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": search},
+        text=True,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.stdout.split("\n")[0] == f"2 processes {whole.n_excluded}", done.stderr
+
+
 BAD = [
     (["campaign", "scalar.toml"], "give --runs 100"),
     (["campaign", "scalar.toml", "--runs", "9", "--member", "9"], "no member 9 among 9 runs"),
