@@ -37,13 +37,11 @@ def configuration(plan: Plan) -> dict[str, Any]:
 _OTHER = {"system": "another system", "seed": "another seed", "members": "other members"}
 
 
-def difference(key: str, mine: Any, theirs: Any) -> str:
-    """Say how a checkpoint's identity differs from that of the system it is given to."""
-    if key != "configuration":
-        return (
-            f"the checkpoint belongs to {_OTHER[key]}: {theirs!r} there, {mine!r} here\n"
-            f"  resume it with the {key} it was made with"
-        )
+def first_difference(mine: Any, theirs: Any) -> tuple[str, str | None, Any, Any] | None:
+    """Part and name of the first setting that differs, and what it is there and here.
+
+    The name is None where a part differs that has no names; None is returned where nothing does.
+    """
     for part, values in mine.items():
         other = (theirs or {}).get(part)
         if values == other:
@@ -51,10 +49,25 @@ def difference(key: str, mine: Any, theirs: Any) -> str:
         if isinstance(values, dict) and isinstance(other, dict):
             for name in sorted(set(values) | set(other)):
                 if values.get(name) != other.get(name):
-                    return (
-                        f"the checkpoint was made with other {part}: '{name}' is\n"
-                        f"  {other.get(name)} there\n  {values.get(name)} here\n"
-                        "  give the same system file and --set options"
-                    )
+                    return part, name, other.get(name), values.get(name)
+        return part, None, other, values
+    return None
+
+
+def difference(key: str, mine: Any, theirs: Any) -> str:
+    """Say how a checkpoint's identity differs from that of the system it is given to."""
+    if key != "configuration":
+        return (
+            f"the checkpoint belongs to {_OTHER[key]}: {theirs!r} there, {mine!r} here\n"
+            f"  resume it with the {key} it was made with"
+        )
+    found = first_difference(mine, theirs)
+    if found is None:
+        return "the checkpoint was made with another configuration"
+    part, name, there, here = found
+    if name is None:
         return f"the checkpoint was made with other {part}: give the same system file and options"
-    return "the checkpoint was made with another configuration"
+    return (
+        f"the checkpoint was made with other {part}: '{name}' is\n  {there} there\n  {here} here\n"
+        "  give the same system file and --set options"
+    )

@@ -65,7 +65,7 @@ def kernel_source(kernel: Kernel) -> str:
     code = generator.dump()
     if kernel.function.is_a("SXFunction"):
         code = without_null_checks(code)
-    lines = ["#define CASADI_SYMBOLEXPORT static", code]
+    lines = ["#define CASADI_SYMBOL_EXPORT static", code]
     lines += [f"#define {name} {value}".rstrip() for name, value in definitions.items()]
     return "\n".join([*lines, _driver()])
 

@@ -336,6 +336,7 @@ class _Analysis:
                     f"'{path}' ({type(component).__name__}) has no symbolic Jacobian, so the "
                     "system cannot be linearized\n  fly a campaign instead"
                 )
+        self._error_jacobian = _error_jacobian(self.error_model)
         self.connections = {c.target: c for c in flat.connections}
         self.dispersed: dict[Key, Dispersion] = {}
         for d in flat.dispersions:
@@ -711,15 +712,7 @@ class _Analysis:
     # ------------------------------------------------------------------ the error
 
     def _evaluate(self, t: float) -> None:
-        import casadi as ca
-
         model = self.error_model
-        if not hasattr(self, "_error_jacobian"):
-            symbols = list(model.inputs.values())
-            by = ca.vertcat(*(ca.vec(s) for s in symbols))
-            self._error_jacobian = ca.Function(
-                "by", symbols, [ca.densify(ca.jacobian(ca.SX(model.outputs["error"]), by))]
-            )
         evaluation = self.evaluation
         values = []
         E = np.zeros((int(model.outputs["error"].numel()), self.size))
@@ -764,6 +757,16 @@ class _Analysis:
         )
 
 
+def _error_jacobian(model: Any) -> Any:
+    """Derivative of the error by all inputs of its model, one after the other."""
+    import casadi as ca
+
+    symbols = list(model.inputs.values())
+    by = ca.vertcat(*(ca.vec(s) for s in symbols))
+    jacobian = ca.jacobian(ca.SX(model.outputs["error"]), by)
+    return ca.Function("by", symbols, [ca.densify(jacobian)])
+
+
 def _dispersed_covariance(d: Dispersion, components: Any, nominal: FloatArray) -> FloatArray:
     """Covariance of a dispersion's draw, for a parameter of the given nominal value."""
     spread = d.read_spread(components)
@@ -806,7 +809,6 @@ def _directions(system: System, length: Any, result: LinearCovariance) -> list[D
         for name, port in flat.components[corrector].inputs().items():
             if port.kind == "message":
                 reader = flat.components[corrector]._views[name]
-                reader.refresh = lambda tick: None  # noqa: ARG005
                 waiting = deaf.master._entries[corrector]
                 waiting.before = tuple(
                     t for t in waiting.before if getattr(t, "__self__", None) is not reader

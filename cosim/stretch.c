@@ -8,11 +8,6 @@
 #include <stdint.h>
 #include <string.h>
 
-#if defined(_WIN32)
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT __attribute__((visibility("default")))
-#endif
 #define MOST_LANES 8
 #define AHEAD 4 /* steps whose noise is drawn at once */
 

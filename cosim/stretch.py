@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from terrafix.cosim import toolchain
 from terrafix.cosim.kernel_base import BoundArrays, Kernel
+from terrafix.cosim.kernel_compiled import EXPORT
 
 FloatArray = NDArray[np.float64]
 _ALIGNMENT = 8  # doubles: a register, a cache line
@@ -117,7 +118,7 @@ class Stage:
 @cache
 def _driver() -> Any:
     source = Path(__file__).with_name("stretch.c").read_text()
-    function = toolchain.load(source)["terrafix_stretch"]
+    function = toolchain.load(EXPORT + source)["terrafix_stretch"]
     function.restype = ctypes.c_int64
     function.argtypes = (ctypes.c_void_p, ctypes.c_void_p)
     return function
@@ -209,9 +210,9 @@ class Stretch:
         )
         self._at = ctypes.addressof(self._call)
         n_tiles = -(-self._n_members // self._lanes)
-        n_parts = 1 if single else max(1, min(available_threads(), n_tiles // _TILES_PER_THREAD))
+        n_threads = 1 if single else max(1, min(available_threads(), n_tiles // _TILES_PER_THREAD))
         self._call.n_tiles = n_tiles
-        self._scratches = [self._scratch() for _ in range(n_parts)]
+        self._scratches = [self._scratch() for _ in range(n_threads)]
         self._fly = _driver()
 
     def _room(self, vectors: int) -> int:

@@ -165,7 +165,7 @@ def _row_mean(rows: FloatArray) -> FloatArray:
 
 
 def _innovations(z: FloatArray) -> Block:
-    """Sums of normalized innovations, and of their products with those of the fix before."""
+    """Sums of products of normalized innovations with those of the fix before, and of squares."""
     n_members, size = z.shape[1:]
     sums = np.zeros((3, size))
     finite = np.isfinite(z)
@@ -178,9 +178,6 @@ def _innovations(z: FloatArray) -> Block:
         sums[1] += np.where(both, 0.5 * (values[1:] ** 2 + values[:-1] ** 2), 0.0).sum(axis=0)
         sums[2] += both.sum(axis=0)
     return {
-        "innovation_sum": np.where(finite, z, 0.0).sum(axis=1),
-        "innovation_square": np.where(finite, z * z, 0.0).sum(axis=1),
-        "innovation_n": finite.sum(axis=1).astype(np.int64),
         "lag_product": sums[0],
         "lag_square": sums[1],
         "lag_n": sums[2],
@@ -200,7 +197,6 @@ def _histogram(z: FloatArray) -> NDArray[np.uint8]:
 
 _ADDED = [
     *("predicted", "nees_sum", "nees_n", "nis_sum", "nis_n", "dof"),
-    *("innovation_sum", "innovation_square", "innovation_n"),
     *("lag_product", "lag_square", "lag_n"),
 ]
 _JOINED = {"shown_error": 1, "shown_sigma": 1, "shown_nees": 1}

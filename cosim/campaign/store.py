@@ -1,7 +1,8 @@
 """A campaign's folder: what it is, the blocks that are done, the result.
 
     campaign.json        system, seed, runs, configuration, versions
-    blocks/000000.npz    sums, dispersed parameters and failures of members 0 to 63; and so on
+    blocks/000000.npz    of members 0 to 63: sums, dispersed parameters, failures, and of each its
+                         last error and mean NEES and NIS; and so on
     histories/000000.nc  their full records, where these were asked for
     result.nc            the statistics of all
     summary.json         the same for people and programs, with the verdict
@@ -20,6 +21,7 @@ import numpy as np
 
 from terrafix.cosim.campaign.batch import BlockResult
 from terrafix.cosim.errors import CheckpointError, ConfigurationError
+from terrafix.cosim.identity import first_difference
 from terrafix.cosim.record import write_atomically
 from terrafix.cosim.storage import locked
 
@@ -95,7 +97,7 @@ class Store:
             if key == "configuration":
                 raise CheckpointError(
                     f"'{self.folder}' holds a campaign of another configuration\n"
-                    f"  {_first_difference(mine, other)}"
+                    f"  {_shown(first_difference(mine, other))}"
                 )
             if key == "versions":
                 changed = [k for k in mine if mine[k] != (other or {}).get(k)]
@@ -187,14 +189,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return found
 
 
-def _first_difference(mine: Any, theirs: Any) -> str:
-    for part, values in mine.items():
-        other = (theirs or {}).get(part)
-        if values == other:
-            continue
-        if isinstance(values, dict) and isinstance(other, dict):
-            for name in sorted(set(values) | set(other)):
-                if values.get(name) != other.get(name):
-                    return f"{part} '{name}': {other.get(name)} there, {values.get(name)} here"
-        return f"its {part} differ"
-    return "it differs"
+def _shown(found: tuple[str, str | None, Any, Any] | None) -> str:
+    if found is None:
+        return "it differs"
+    part, name, there, here = found
+    return f"its {part} differ" if name is None else f"{part} '{name}': {there} there, {here} here"

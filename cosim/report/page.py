@@ -138,7 +138,8 @@ def _evaluation(campaign: Campaign, path: str) -> Iterator[str]:
     yield from _end_table(evaluation, prediction)
     yield from _consistency(evaluation)
     yield f"<h2>Figures{suffix}</h2>"
-    for name, draw in figures(dataset, prediction).items():
+    drawn = figures(dataset, prediction)
+    for name, draw in drawn.items():
         if name != "error_budget":
             quantity = name.removesuffix("_error").replace("_", " ")
             caption = _CAPTIONS.get(
@@ -152,7 +153,7 @@ def _evaluation(campaign: Campaign, path: str) -> Iterator[str]:
         reason = "; ".join(campaign.notes) or "no linear covariance analysis was made"
         yield f"<p>{escape(reason)}.</p>"
     else:
-        yield _image(figures(dataset, prediction)["error_budget"], _CAPTIONS["error_budget"])
+        yield _image(drawn["error_budget"], _CAPTIONS["error_budget"])
         yield from _budget_table(prediction)
         yield from _directions(prediction)
 
