@@ -15,7 +15,7 @@ LAYERS = {
     "components": ROOT / "components",
     "cli": ROOT / "src" / "terrafix",
 }
-MODULES = sorted((layer, path) for layer, folder in LAYERS.items() for path in folder.glob("*.py"))
+MODULES = sorted((layer, path) for layer, folder in LAYERS.items() for path in folder.rglob("*.py"))
 MAY_IMPORT = {
     "models": {"models"},
     "cosim": {"cosim"},
