@@ -123,7 +123,8 @@ def layouts(simulation: Simulation, duration: Fraction) -> dict[str, Layout]:
     if not found:
         raise ConfigurationError(
             f"system '{simulation.system.name}' has no evaluation component, so a campaign would "
-            "have no statistics\n  add one (terrafix components lists the types), or use terrafix run"
+            "have no statistics\n"
+            "  add one (terrafix components lists the types), or use terrafix run"
         )
     return found
 
