@@ -52,8 +52,8 @@ def _campaign(runs: int, case: str, *, seed: int = 2008, sets: Any = (), **optio
 
 def _with_records() -> Any:
     """The open loop with truth and estimate recorded at 1 Hz."""
-    from terrafix.cosim.clock import Rate
-    from terrafix.cosim.files import read_system
+    from terrafix.cosim.basics.clock import Rate
+    from terrafix.cosim.files.reading import read_system
 
     system = read_system(SYSTEM, [("case", "TC-1")])
     system.records.clear()
@@ -71,7 +71,7 @@ def _hundred(scale: float, threads: int) -> dict[str, Any]:
     from terrafix.cosim.campaign.batch import layouts
     from terrafix.cosim.campaign.statistics import Statistics, block_of
     from terrafix.cosim.campaign.verdict import judge
-    from terrafix.cosim.simulation import Simulation
+    from terrafix.cosim.engine.simulation import Simulation
 
     system = _with_records()
     duration = f"{590.4 * scale:.1f}"
@@ -213,8 +213,8 @@ def wrong_model(scale: float) -> dict[str, Any]:
 
 
 def _against_lincov(result: Any, case: str, sets: Any) -> dict[str, Any]:
-    from terrafix.cosim.files import read_system
-    from terrafix.cosim.lincov import linear_covariance
+    from terrafix.cosim.files.reading import read_system
+    from terrafix.cosim.lincov.deviations import linear_covariance
 
     began = time.perf_counter()
     found = linear_covariance(read_system(SYSTEM, [("case", case), *sets]))
@@ -324,7 +324,7 @@ def main() -> None:
     if arguments.measure:
         print(json.dumps(MEASURES[arguments.measure](arguments.scale)))
         return
-    from terrafix.cosim.results import cpu_name, versions
+    from terrafix.cosim.records.results import cpu_name, versions
 
     print(f"{cpu_name()}, {os.cpu_count()} processors; {versions()}")
     scale = 0.05 if arguments.quick else 1.0

@@ -18,20 +18,21 @@ from typing import Any
 import numpy as np
 
 from terrafix.components.fields import FIX
-from terrafix.cosim.clock import Rate
-from terrafix.cosim.component import Component
-from terrafix.cosim.evaluation import chi_square_interval
-from terrafix.cosim.parameters import Parameter
-from terrafix.cosim.ports import Input, MessageOutput
-from terrafix.cosim.run import simulate
-from terrafix.cosim.system import System
-from terrafix.models.boresight import Boresight, boresight_on_terrain
-from terrafix.models.consistency import normalized_square
-from terrafix.models.dem import read_jacksboro
-from terrafix.models.effective_velocity import effective_velocity_array
-from terrafix.models.geolocation import track_axes
-from terrafix.models.matching import REASONS as MATCHED
-from terrafix.models.mekf import navigation_error_array
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.ensembles import chi_square_interval
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import Input, MessageOutput
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.system.system import System
+from terrafix.models.filters.consistency import normalized_square
+from terrafix.models.filters.spacecraft import navigation_error_array
+from terrafix.models.geometry.geolocation import track_axes
+from terrafix.models.images.matching import REASONS as MATCHED
+from terrafix.models.maps.dem import read_jacksboro
+from terrafix.models.radar.boresight import Boresight, boresight_on_terrain
+from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_closed_loop.toml"
 IMAGING = ("terrain", "echo", "reference", "former", "matcher", "album")
@@ -80,7 +81,7 @@ def boresight(r: Any, v: Any, q_be: Any, q_mu: Any) -> Boresight:
 
 def closed_loop(case: str, number: int) -> System:
     """One set: a place, a surface and a misalignment of its own."""
-    system = System.from_file(SYSTEM, settings=[("case", case)])
+    system = read_system(SYSTEM, settings=[("case", case)])
     rng = np.random.default_rng([20081, number])
     parts = system.nodes
     parts["antenna"].misalignment = SIGMA[case] * rng.standard_normal(3)

@@ -16,19 +16,20 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from terrafix.cosim.clock import Rate
-from terrafix.cosim.fmi import fleet
-from terrafix.cosim.fmi.archive import open_archive
-from terrafix.cosim.fmi.binding import CO_SIMULATION
-from terrafix.cosim.fmi.component import Fmu
-from terrafix.cosim.fmi.export import export_fmu
-from terrafix.cosim.fmi.fleet import Fleet, Group, Setup
-from terrafix.cosim.fmi.reading import read_interface
-from terrafix.cosim.ports import Input, Output
-from terrafix.cosim.simulation import Simulation
-from terrafix.cosim.symbolic import SymbolicComponent
-from terrafix.cosim.system import System
-from terrafix.models.model import Model
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.exchange.fmi.run import fleet
+from terrafix.cosim.exchange.fmi.run.archive import open_archive
+from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION
+from terrafix.cosim.exchange.fmi.run.component import Fmu
+from terrafix.cosim.exchange.fmi.run.fleet import Fleet, Group, Setup
+from terrafix.cosim.exchange.fmi.run.reading import read_interface
+from terrafix.cosim.exchange.fmi.write.export import export_fmu
+from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.kernels.symbolic import SymbolicComponent
+from terrafix.cosim.system.system import System
+from terrafix.models.core.model import Model
 
 N = 20_000
 OPEN_LOOP = Path(__file__).parents[1] / "examples" / "spacecraft_sar_open_loop.toml"
@@ -177,7 +178,7 @@ def main() -> None:
         print("set, step, get of three doubles, microseconds per component step")
         for label, cost in rows:
             print(f"  {label:<48} {cost:7.2f}  {cost / reference:5.2f} of FMPy")
-        system = System.from_file(OPEN_LOOP)
+        system = read_system(OPEN_LOOP)
         for name in ("orbit", "imu", "predict", "correct"):
             seconds = best(
                 lambda n=name: export_fmu(system, Path(folder, "x.fmu"), component=n), repeats=1

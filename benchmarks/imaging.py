@@ -18,12 +18,17 @@ import cv2
 import numpy as np
 from scipy import fft
 
-from terrafix.models.autofocus import SharpnessCurve, autofocus
-from terrafix.models.chirp import Radar
-from terrafix.models.doppler import fractional_centroid, unwrapped_centroid
-from terrafix.models.focusing import RangeDoppler, azimuth_compressed, azimuth_looks, range_doppler
-from terrafix.models.matching import Searchable, matched
-from terrafix.models.recording import read_recording
+from terrafix.models.images.matching import Searchable, matched
+from terrafix.models.radar.autofocus import SharpnessCurve, autofocus
+from terrafix.models.radar.chirp import Radar
+from terrafix.models.radar.doppler import fractional_centroid, unwrapped_centroid
+from terrafix.models.radar.focusing import (
+    RangeDoppler,
+    azimuth_compressed,
+    azimuth_looks,
+    range_doppler,
+)
+from terrafix.models.radar.recording import read_recording
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT / ".." / "shared" / "data"))

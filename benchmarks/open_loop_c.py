@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-import terrafix.cosim
-from terrafix.cosim.files import read_system
-from terrafix.cosim.noise import stream_key
-from terrafix.cosim.run import simulate
-from terrafix.cosim.system import System
+import terrafix.cosim.kernels
+from terrafix.cosim.basics.noise import stream_key
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.system.system import System
 
 SOURCE = Path(__file__).with_name("open_loop.c")
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_open_loop.toml"
@@ -87,7 +87,7 @@ Settings = Sequence[tuple[str, str]]
 @functools.cache
 def library() -> ctypes.CDLL:
     """The program, compiled now; the file is not needed once it is loaded."""
-    include = Path(terrafix.cosim.__file__).parent
+    include = Path(terrafix.cosim.kernels.__file__).parent
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "open_loop.so")
         subprocess.run(

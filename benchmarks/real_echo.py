@@ -20,21 +20,22 @@ import cv2
 import numpy as np
 
 from terrafix.components.fields import FIX
-from terrafix.components.reference import RecordedReference
-from terrafix.cosim.clock import Rate
-from terrafix.cosim.component import Component
-from terrafix.cosim.parameters import Parameter
-from terrafix.cosim.ports import Input, MessageOutput
-from terrafix.cosim.run import simulate
-from terrafix.cosim.system import System
-from terrafix.models.boresight import Boresight, boresight_on_terrain
-from terrafix.models.dem import flat_dem
-from terrafix.models.effective_velocity import effective_velocity_array
-from terrafix.models.geolocation import track_axes
-from terrafix.models.matching import REASONS as MATCHED
-from terrafix.models.mekf import REASONS as JUDGED
-from terrafix.models.mekf import navigation_error_array
-from terrafix.models.reference import Reference
+from terrafix.components.images.reference import RecordedReference
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import Input, MessageOutput
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.system.system import System
+from terrafix.models.filters.spacecraft import REASONS as JUDGED
+from terrafix.models.filters.spacecraft import navigation_error_array
+from terrafix.models.geometry.geolocation import track_axes
+from terrafix.models.images.matching import REASONS as MATCHED
+from terrafix.models.images.reference import Reference
+from terrafix.models.maps.dem import flat_dem
+from terrafix.models.radar.boresight import Boresight, boresight_on_terrain
+from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_real_echo.toml"
 TIMES = ("4.42", "6.09", "7.4")  # [s]
@@ -117,7 +118,7 @@ def boresight(antenna: Any, r: Any, v: Any, q_be: Any, q_mu: Any) -> Boresight:
 
 
 def real_echo() -> System:
-    system = System.from_file(SYSTEM)
+    system = read_system(SYSTEM)
     parts = system.nodes
     system.record("pointing", [parts["attitude"]["q_be"], parts["antenna"]["q_mu"]], period="0.01")
     return system

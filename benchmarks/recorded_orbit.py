@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix.cosim.files import read_system
-from terrafix.cosim.run import simulate
-from terrafix.models.earth import EARTH
-from terrafix.models.ephemeris import Ephemeris, read_eof
-from terrafix.models.frames import inertial_from_earth_fixed_array
-from terrafix.models.orbit import orbit_model
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.files.reading import read_system
+from terrafix.models.geometry.earth import EARTH
+from terrafix.models.geometry.frames import inertial_from_earth_fixed_array
+from terrafix.models.motion.ephemeris import Ephemeris, read_eof
+from terrafix.models.motion.orbit import orbit_model
 
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_recorded_orbit.toml"
 NOISE = (3.5e-11, 1e-8, 1e-7, 3e-7, 7e-7, 1e-6, 2.7e-6, 1e-5)

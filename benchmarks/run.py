@@ -20,14 +20,14 @@ from statistics import median
 
 import numpy as np
 
-from terrafix.cosim.clock import Rate
-from terrafix.cosim.component import Component
-from terrafix.cosim.files import read_system
-from terrafix.cosim.ports import Input, Output
-from terrafix.cosim.results import cpu_name, versions
-from terrafix.cosim.run import simulate
-from terrafix.cosim.simulation import Simulation
-from terrafix.cosim.system import System
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.records.results import cpu_name, versions
+from terrafix.cosim.system.system import System
 
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_open_loop.toml"
 

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
-from terrafix.cosim.ports import Field
-
-FloatArray = NDArray[np.float64]
+from terrafix.cosim.memory.fields import Field
 
 STATE_AXES = (
     *("r_x", "r_y", "r_z"),
@@ -50,7 +45,7 @@ INNOVATION = {
     "nis": Field((), "1", doc="normalized innovation squared, not underweighted"),
     "dof": Field((), "1", doc="number of elements used"),
     "accepted": Field((), "1", doc="1 if the fix corrected the estimate, else 0"),
-    "reason": Field((), "1", doc="index into terrafix.models.mekf.REASONS"),
+    "reason": Field((), "1", doc="index into terrafix.models.filters.spacecraft.REASONS"),
 }
 """What a correction says about the fix it was given."""
 

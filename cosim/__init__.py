@@ -1,1 +1,1 @@
-"""Co-simulation: exact time, ports, systems, master, records, checkpoints. Knows no navigation."""
+"""Co-simulation: time, ports, systems, master, records, campaigns, FMUs; knows no navigation."""

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix.cosim.files import read_system
-from terrafix.cosim.run import Result, simulate
+from terrafix.cosim.engine.run import Result, simulate
+from terrafix.cosim.files.reading import read_system
 
 SYSTEM = Path(__file__).parent / "spacecraft_sar_open_loop.toml"
 
@@ -23,7 +23,7 @@ def main(*, members: int = 20, duration: str = "590.4", plot: str | None = None)
     predicted, sample = (np.linalg.norm(position[k]) for k in ("sigma_predicted", "sigma_sample"))
     print(f"position sigma after {duration} s: predicted {predicted:.0f} m, sample {sample:.0f} m")
     if plot is not None:
-        from terrafix.cosim.plots import plot_result
+        from terrafix.cosim.show.plots import plot_result
 
         plot_result(result.dataset, plot)
     return result

@@ -18,13 +18,14 @@ import casadi as ca
 import fmpy
 import numpy as np
 
-from terrafix.cosim.fmi.component import Fmu
-from terrafix.cosim.fmi.export import export_fmu
-from terrafix.cosim.run import simulate
-from terrafix.cosim.system import System
-from terrafix.models.earth import EARTH
-from terrafix.models.frames import earth_fixed_from_inertial
-from terrafix.models.gravity import j2_acceleration
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.exchange.fmi.run.component import Fmu
+from terrafix.cosim.exchange.fmi.write.export import export_fmu
+from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.system.system import System
+from terrafix.models.geometry.earth import EARTH
+from terrafix.models.geometry.frames import earth_fixed_from_inertial
+from terrafix.models.motion.gravity import j2_acceleration
 
 SYSTEM = Path(__file__).with_name("spacecraft_sar_open_loop.toml")
 DURATION = "120"
@@ -89,9 +90,9 @@ def main(arguments: list[str] | None = None) -> float:
     parser.add_argument("--exporter", choices=EXPORTERS, default="terrafix")
     parser.add_argument("--plot", metavar="FILE.png")
     options = parser.parse_args(arguments)
-    native = simulate(System.from_file(SYSTEM), members=1, duration=DURATION).dataset
+    native = simulate(read_system(SYSTEM), members=1, duration=DURATION).dataset
     with tempfile.TemporaryDirectory() as folder:
-        system = System.from_file(SYSTEM)
+        system = read_system(SYSTEM)
         system.replace("orbit", EXPORTERS[options.exporter](system, Path(folder)))
         flown = simulate(system, members=1, duration=DURATION).dataset
     apart = np.linalg.norm(flown["orbit.r_e"].values - native["orbit.r_e"].values, axis=-1)

@@ -8,14 +8,14 @@ import argparse
 
 import numpy as np
 
-from terrafix.components.orbit import OrbitTruth
-from terrafix.cosim.clock import Rate
-from terrafix.cosim.component import Component
-from terrafix.cosim.parameters import Parameter
-from terrafix.cosim.ports import Input, Output
-from terrafix.cosim.run import Result, simulate
-from terrafix.cosim.system import System
-from terrafix.models.geodesy import geodetic_from_ecef_array
+from terrafix.components.truth.orbit import OrbitTruth
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.engine.run import Result, simulate
+from terrafix.cosim.system.system import System
+from terrafix.models.geometry.geodesy import geodetic_from_ecef_array
 
 
 class Altimeter(Component):
@@ -52,7 +52,7 @@ def main(*, members: int = 50, plot: str | None = None) -> Result:
     last = result.dataset["altimeter.height"][-1].to_numpy()
     print(f"height {np.mean(last) / 1e3:.3f} km, spread of readings {np.std(last, ddof=1):.1f} m")
     if plot is not None:
-        from terrafix.cosim.plots import plot_result
+        from terrafix.cosim.show.plots import plot_result
 
         plot_result(result.dataset, plot)
     return result

@@ -4,24 +4,35 @@ import ast
 import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-LAYERS = {
-    "models": ROOT / "models",
-    "cosim": ROOT / "cosim",
-    "components": ROOT / "components",
-    "cli": ROOT / "src" / "terrafix",
+WINGS = {
+    "models": "models",
+    "cosim": "cosim",
+    "components": "components",
+    "terrafix": "src/terrafix",
 }
-MODULES = sorted((layer, path) for layer, folder in LAYERS.items() for path in folder.rglob("*.py"))
-MAY_IMPORT = {
-    "models": {"models"},
-    "cosim": {"cosim"},
-    "components": {"models", "cosim", "components"},
-    "cli": {"cosim", "components", "cli"},
-}
+"""Folder of each wing; the last holds the import name and the command line."""
+ORDER = [
+    *("models.core", "models.geometry", "models.motion", "models.maps", "models.sensors"),
+    *("models.radar", "models.images", "models.filters", "models"),
+    *("cosim.basics", "cosim.show", "cosim.memory", "cosim.declare", "cosim.kernels"),
+    *("cosim.system", "cosim.files", "cosim.records", "cosim.engine", "cosim.lincov"),
+    *("cosim.campaign", "cosim.report"),
+    *("cosim.exchange.fmi.run", "cosim.exchange.fmi.write", "cosim.exchange.fmi.check"),
+    *("cosim.exchange.fmi", "cosim.exchange.ssp", "cosim.exchange", "cosim"),
+    *("components", "components.truth", "components.sensors", "components.images"),
+    *("components.filters", "components.judges"),
+    *("terrafix.cli", "terrafix"),
+]
+"""Every folder, from the bottom up: each imports only from those before it."""
+FORBIDDEN = {("cosim", "models")}
+"""Wings that do not know each other, though the order would allow it."""
+MODULES = sorted((wing, path) for wing, at in WINGS.items() for path in (ROOT / at).rglob("*.py"))
 NAVIGATION = {
     *("aircraft", "altitude", "antenna", "attitude", "azimuth", "boresight", "camera", "doppler"),
     *("earth", "ecef", "ellipsoid", "gyro", "gyroscope", "imu", "inertial", "kalman", "landmark"),
@@ -30,9 +41,9 @@ NAVIGATION = {
 }
 HEAVY = {
     "terrafix": "numpy casadi scipy xarray pint matplotlib netCDF4 rich click cv2 fmpy",
-    "terrafix.cosim.system": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
-    "terrafix.cosim.run": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
-    "terrafix.cosim.files": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
+    "terrafix.cosim.system.system": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
+    "terrafix.cosim.engine.run": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
+    "terrafix.cosim.files.reading": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
     "terrafix.cli": "numpy casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
 }
 
@@ -53,25 +64,75 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def layer_of(module: str) -> str | None:
-    """Layer of a module of ours; None for others."""
-    parts = module.split(".")
-    if parts[0] != "terrafix":
-        return None
-    return parts[1] if len(parts) > 1 and parts[1] in LAYERS else "cli"
+def dotted(wing: str, path: Path) -> str:
+    """Import name of a module without "terrafix.", the wing first."""
+    parts = path.relative_to(ROOT / WINGS[wing]).with_suffix("").parts
+    return ".".join([wing, *(part for part in parts if part != "__init__")])
 
 
-@pytest.mark.parametrize(("layer", "path"), MODULES, ids=names(MODULES))
-def test_imports_point_one_way(layer, path):
-    reached = {layer_of(m) for m in imported(path)} - {None}
-    assert reached <= MAY_IMPORT[layer], f"{path} imports from {reached - MAY_IMPORT[layer]}"
+NAMED = {dotted(wing, path): path for wing, path in MODULES}
+
+
+def room_of(module: str) -> str:
+    """The folder a module of ours lies in."""
+    return module if NAMED[module].name == "__init__.py" else module.rpartition(".")[0]
+
+
+def reached(path: Path) -> set[str]:
+    """Modules of ours that a file imports, or imports something from."""
+    found = set()
+    for name in imported(path):
+        parts = name.split(".")
+        if parts[0] != "terrafix":
+            continue
+        parts = parts[1:] if len(parts) > 1 and parts[1] in WINGS else parts
+        while parts and ".".join(parts) not in NAMED:
+            parts.pop()
+        found.add(".".join(parts) or "terrafix")
+    return found
+
+
+def test_the_order_names_every_folder():
+    assert sorted(ORDER) == sorted({room_of(module) for module in NAMED})
+
+
+@pytest.mark.parametrize("module", NAMED)
+def test_imports_between_folders_run_one_way(module):
+    own = room_of(module)
+    for other in reached(NAMED[module]):
+        room = room_of(other)
+        assert room == own or ORDER.index(room) < ORDER.index(own), f"{module} climbs to {other}"
+        assert (own.split(".")[0], room.split(".")[0]) not in FORBIDDEN
+
+
+def test_imports_within_folders_have_no_circles():
+    graph = {
+        module: {o for o in reached(path) if room_of(o) == room_of(module)} - {module}
+        for module, path in NAMED.items()
+    }
+    list(TopologicalSorter(graph).static_order())  # raises CycleError, which names the circle
 
 
 def test_the_walk_sees_imports():
-    """The test above could fail: it finds what is imported, inside functions too."""
-    assert "terrafix.cosim.results.read_result" in imported(ROOT / "components" / "playback.py")
-    assert layer_of("terrafix.models.sar") == "models"
-    assert layer_of("terrafix.progress.ProgressBar") == "cli"
+    """The tests above could fail: what is imported is found, inside functions too."""
+    assert "cosim.records.results" in reached(NAMED["components.truth.playback"])
+    assert room_of("models.sensors.sar") == "models.sensors"
+    assert "terrafix.cli" in reached(NAMED["terrafix.__main__"])
+
+
+@pytest.mark.parametrize("room", ORDER)
+def test_every_folder_says_in_one_sentence_what_belongs_in_it(room):
+    doc = ast.get_docstring(ast.parse(NAMED[room].read_text()))
+    first = doc.split("\n\n")[0]
+    assert first.endswith(".")
+    assert ". " not in first
+
+
+def test_tests_lie_in_the_folders_of_what_they_test():
+    """Each folder of tests is a folder of the house; systems and examples are tested whole."""
+    folders = {p.parent.relative_to(ROOT / "tests") for p in (ROOT / "tests").rglob("test_*.py")}
+    rooms = {*(Path(*room.removeprefix("terrafix.").split(".")) for room in ORDER), Path()}
+    assert folders - rooms == {Path("systems"), Path("examples")}
 
 
 @pytest.mark.parametrize(("layer", "path"), MODULES, ids=names(MODULES))
@@ -125,8 +186,8 @@ def test_the_core_knows_no_navigation(path):
 
 def test_the_list_of_words_would_find_navigation():
     """The components are full of them; each of these must be seen."""
-    assert {"orbit", "earth", "velocity"} <= vocabulary(ROOT / "components" / "orbit.py")
-    assert {"sar", "antenna", "boresight"} <= vocabulary(ROOT / "components" / "sar.py")
+    assert {"orbit", "earth", "velocity"} <= vocabulary(ROOT / "components" / "truth" / "orbit.py")
+    assert {"sar", "antenna", "boresight"} <= vocabulary(ROOT / "components" / "sensors" / "sar.py")
 
 
 # ------------------------------------------------------------------------- quick to import

@@ -18,11 +18,11 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafix.cosim.basics.errors import ConfigurationError, StepError
 from terrafix.cosim.campaign.statistics import BLOCK, Block, Layout, block_of
-from terrafix.cosim.errors import ConfigurationError, StepError
-from terrafix.cosim.evaluation import Evaluation
-from terrafix.cosim.simulation import Simulation
-from terrafix.cosim.system import System
+from terrafix.cosim.declare.evaluation import Evaluation
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.system.system import System
 
 BATCH_BYTES = 48 * 2**20
 """Of evaluation histories that a batch holds in memory: this decides how many members it has."""
@@ -38,7 +38,7 @@ class FileSource:
 
     def read(self) -> System:
         """Read the file."""
-        from terrafix.cosim.files import read_system
+        from terrafix.cosim.files.reading import read_system
 
         return read_system(self.path, list(self.settings))
 
@@ -263,7 +263,7 @@ def _blocks(
 
 
 def _write_histories(task: Task, simulation: Simulation, members: NDArray[np.int64]) -> None:
-    from terrafix.cosim.results import write_netcdf
+    from terrafix.cosim.records.results import write_netcdf
 
     assert task.histories is not None
     folder = Path(task.histories)

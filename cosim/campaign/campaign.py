@@ -9,13 +9,12 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
-from fractions import Fraction
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from terrafix.cosim.basics.clock import Exact, seconds, text_seconds
+from terrafix.cosim.basics.errors import ConfigurationError, RateError, StepError, TerrafixError
 from terrafix.cosim.campaign import pools
 from terrafix.cosim.campaign.batch import (
     BlockResult,
@@ -24,95 +23,20 @@ from terrafix.cosim.campaign.batch import (
     layouts,
     members_per_batch,
 )
-from terrafix.cosim.campaign.results import build_result, summary_of
-from terrafix.cosim.campaign.statistics import BLOCK, SHOWN, Statistics
+from terrafix.cosim.campaign.results import CampaignResult
+from terrafix.cosim.campaign.statistics import BLOCK, Statistics
 from terrafix.cosim.campaign.store import RESULT, SUMMARY, Store
-from terrafix.cosim.campaign.verdict import Verdict, judge
-from terrafix.cosim.clock import Exact, seconds, text_seconds
-from terrafix.cosim.errors import ConfigurationError, RateError, StepError, TerrafixError
-from terrafix.cosim.identity import configuration
-from terrafix.cosim.record import write_atomically
-from terrafix.cosim.simulation import MAX_MEMBER, Simulation
-from terrafix.cosim.system import System
+from terrafix.cosim.campaign.verdict import judge
+from terrafix.cosim.engine.simulation import MAX_MEMBER, Simulation
+from terrafix.cosim.records.recorder import write_atomically
+from terrafix.cosim.system.identity import configuration
+from terrafix.cosim.system.system import System
 
 Progress = Callable[[str, float], None]
-MOST_NAMED = 1000
-"""Failed members listed in a result; all are counted, and all are in the blocks."""
 
 
 class CampaignError(StepError):
     """A campaign that ended early; what is done is in its folder, if it has one."""
-
-
-@dataclass
-class CampaignResult:
-    """What a campaign gives back.
-
-    Attributes
-    ----------
-    system : str
-    seed, runs : int
-    statistics : dict of str to Statistics
-        By evaluation component.
-    verdicts : dict of str to Verdict
-    excluded : list of dict
-        Failed members, up to `MOST_NAMED`: ``member``, ``component``, ``t_s``, ``reason``.
-    n_excluded : int
-    parameters : dict of str to ndarray
-        Dispersed parameters as they reached the components, of the first `SHOWN` members.
-    kernel : str
-    wall_s, setup_s : float
-        Time of flying and merging; time to check and build before it.
-    workers : str
-        What flew it.
-    configuration : dict
-        Everything that was set.
-    out : Path or None
-    """
-
-    system: str
-    doc: str
-    seed: int
-    runs: int
-    duration: Fraction
-    configuration: dict[str, Any]
-    statistics: dict[str, Statistics]
-    workers: str
-    setup_s: float
-    wall_s: float = 0.0
-    kernel: str = ""
-    verdicts: dict[str, Verdict] = field(default_factory=dict)
-    excluded: list[dict[str, Any]] = field(default_factory=list)
-    n_excluded: int = 0
-    reasons: dict[str, int] = field(default_factory=dict)
-    parameters: dict[str, Any] = field(default_factory=dict)
-    parameter_units: dict[str, str] = field(default_factory=dict)
-    graph: str = ""
-    source: dict[str, Any] = field(default_factory=dict)
-    out: Path | None = None
-
-    def summary(self) -> dict[str, Any]:
-        """Plain types, for JSON."""
-        return summary_of(self)
-
-    def dataset(self) -> Any:
-        """Statistics as an `xarray.Dataset`."""
-        return build_result(self)
-
-    def _add(self, block: BlockResult) -> None:
-        for path, sums in block.sums.items():
-            self.statistics[path].add(sums)
-        self.n_excluded += len(block.excluded)
-        for each in block.excluded:
-            self.reasons[each["reason"]] = self.reasons.get(each["reason"], 0) + 1
-            if len(self.excluded) < MOST_NAMED:
-                self.excluded.append(each)
-        if block.number * BLOCK < SHOWN:
-            for name, values in block.parameters.items():
-                before = [self.parameters[name]] if name in self.parameters else []
-                self.parameters[name] = np.concatenate([*before, values])
-        kinds = {k for k in [*self.kernel.split("+"), *block.kernel.split("+")] if k}
-        self.kernel = "+".join(sorted(kinds))
 
 
 def run_campaign(
@@ -251,7 +175,7 @@ def _drawn(system: System) -> str:
     """The system's diagram as SVG."""
     from tempfile import TemporaryDirectory
 
-    from terrafix.cosim.graph import draw
+    from terrafix.cosim.system.graph import draw
 
     with TemporaryDirectory(prefix="terrafix-") as folder:
         file = Path(folder, "graph.svg")
@@ -261,7 +185,7 @@ def _drawn(system: System) -> str:
 
 
 def _identity(result: CampaignResult, *, histories: bool) -> dict[str, Any]:
-    from terrafix.cosim.results import versions
+    from terrafix.cosim.records.results import versions
 
     plain: dict[str, Any] = json.loads(
         json.dumps(
@@ -303,7 +227,7 @@ def _fly(
                 block = store.read(merged)
             if block is None:  # damaged: flown again below
                 return
-            result._add(block)
+            result.add(block)
             merged += 1
             if progress is not None:
                 progress("flying", merged / n_blocks)
@@ -401,7 +325,7 @@ def _kept(what: str, done: int, total: int, result: CampaignResult) -> str:
 
 
 def _write(result: CampaignResult, system: System) -> None:
-    from terrafix.cosim.results import write_netcdf
+    from terrafix.cosim.records.results import write_netcdf
 
     assert result.out is not None
     try:

@@ -12,10 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from terrafix.cosim.campaign.verdict import Verdict
-from terrafix.cosim.display import number, shown_unit
+from terrafix.cosim.show.numbers import number, shown_unit
 
 if TYPE_CHECKING:
-    from terrafix.cosim.campaign.campaign import CampaignResult
+    from terrafix.cosim.campaign.results import CampaignResult
 
 _STYLES = {"consistent": "bold green", "undecided": "bold yellow"}
 NAMED = 5

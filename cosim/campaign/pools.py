@@ -20,8 +20,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+from terrafix.cosim.basics.errors import ConfigurationError, StepError
 from terrafix.cosim.campaign.batch import BlockResult, Task, fly_batch, single_threaded
-from terrafix.cosim.errors import ConfigurationError, StepError
 
 Batch = tuple[int, int]
 """First member, and the one after the last."""

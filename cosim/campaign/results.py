@@ -4,20 +4,99 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from terrafix.cosim.campaign.statistics import QUANTILES, SHOWN, FloatArray, Statistics
-from terrafix.cosim.clock import text_seconds
-from terrafix.cosim.evaluation import chi_square_interval
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.clock import text_seconds
+from terrafix.cosim.basics.ensembles import chi_square_interval
+from terrafix.cosim.campaign.batch import BlockResult
+from terrafix.cosim.campaign.statistics import BLOCK, QUANTILES, SHOWN, Statistics
+from terrafix.cosim.campaign.verdict import Verdict
 
 if TYPE_CHECKING:
     import xarray
 
-    from terrafix.cosim.campaign.campaign import CampaignResult
 
 SCHEMA = "terrafix-campaign-result/1"
+MOST_NAMED = 1000
+"""Failed members listed in a result; all are counted, and all are in the blocks."""
+
+
+@dataclass
+class CampaignResult:
+    """What a campaign gives back.
+
+    Attributes
+    ----------
+    system : str
+    seed, runs : int
+    statistics : dict of str to Statistics
+        By evaluation component.
+    verdicts : dict of str to Verdict
+    excluded : list of dict
+        Failed members, up to `MOST_NAMED`: ``member``, ``component``, ``t_s``, ``reason``.
+    n_excluded : int
+    parameters : dict of str to ndarray
+        Dispersed parameters as they reached the components, of the first `SHOWN` members.
+    kernel : str
+    wall_s, setup_s : float
+        Time of flying and merging; time to check and build before it.
+    workers : str
+        What flew it.
+    configuration : dict
+        Everything that was set.
+    out : Path or None
+    """
+
+    system: str
+    doc: str
+    seed: int
+    runs: int
+    duration: Fraction
+    configuration: dict[str, Any]
+    statistics: dict[str, Statistics]
+    workers: str
+    setup_s: float
+    wall_s: float = 0.0
+    kernel: str = ""
+    verdicts: dict[str, Verdict] = field(default_factory=dict)
+    excluded: list[dict[str, Any]] = field(default_factory=list)
+    n_excluded: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)
+    parameters: dict[str, Any] = field(default_factory=dict)
+    parameter_units: dict[str, str] = field(default_factory=dict)
+    graph: str = ""
+    source: dict[str, Any] = field(default_factory=dict)
+    out: Path | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """Plain types, for JSON."""
+        return summary_of(self)
+
+    def dataset(self) -> Any:
+        """Statistics as an `xarray.Dataset`."""
+        return build_result(self)
+
+    def add(self, block: BlockResult) -> None:
+        """Take up the statistics and failures of one block; blocks come in order."""
+        for path, sums in block.sums.items():
+            self.statistics[path].add(sums)
+        self.n_excluded += len(block.excluded)
+        for each in block.excluded:
+            self.reasons[each["reason"]] = self.reasons.get(each["reason"], 0) + 1
+            if len(self.excluded) < MOST_NAMED:
+                self.excluded.append(each)
+        if block.number * BLOCK < SHOWN:
+            for name, values in block.parameters.items():
+                before = [self.parameters[name]] if name in self.parameters else []
+                self.parameters[name] = np.concatenate([*before, values])
+        kinds = {k for k in [*self.kernel.split("+"), *block.kernel.split("+")] if k}
+        self.kernel = "+".join(sorted(kinds))
 
 
 def ratio_interval(n: int, probability: float = 0.95) -> tuple[float, float]:
@@ -105,7 +184,7 @@ def _evaluation(statistics: Statistics) -> dict[str, Any]:
 
 def summary_of(result: CampaignResult) -> dict[str, Any]:
     """Plain types for JSON; by evaluation component where there are several."""
-    from terrafix.cosim.results import cpu_name, versions
+    from terrafix.cosim.records.results import cpu_name, versions
 
     each = {
         path: _evaluation(s) | {"verdict": result.verdicts[path].summary()}
@@ -189,7 +268,7 @@ def build_result(result: CampaignResult) -> xarray.Dataset:
 
 
 def _attributes(result: CampaignResult) -> dict[str, Any]:
-    from terrafix.cosim.results import cpu_name, versions
+    from terrafix.cosim.records.results import cpu_name, versions
 
     verdicts: Mapping[str, Any] = {p: v.summary() for p, v in result.verdicts.items()}
     plain = {

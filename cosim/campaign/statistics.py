@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.cosim.evaluation import Evaluation
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.declare.evaluation import Evaluation
 
-FloatArray = NDArray[np.float64]
 BLOCK = 64
 """Members of a block."""
 SHOWN = 128

@@ -19,11 +19,11 @@ from typing import IO, Any
 
 import numpy as np
 
+from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError
 from terrafix.cosim.campaign.batch import BlockResult
-from terrafix.cosim.errors import CheckpointError, ConfigurationError
-from terrafix.cosim.identity import first_difference
-from terrafix.cosim.record import write_atomically
-from terrafix.cosim.storage import locked
+from terrafix.cosim.records.places import locked
+from terrafix.cosim.records.recorder import write_atomically
+from terrafix.cosim.system.identity import first_difference
 
 SCHEMA = "terrafix-campaign/1"
 MANIFEST = "campaign.json"

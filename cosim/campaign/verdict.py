@@ -27,7 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from terrafix.cosim.campaign.statistics import FloatArray, Statistics
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.campaign.statistics import Statistics
 
 LEVEL = 0.01
 SIGMA_TOLERANCE = 0.05

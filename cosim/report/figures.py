@@ -8,17 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafix.cosim.display import shown_unit
-from terrafix.cosim.errors import ConfigurationError
-from terrafix.cosim.lincov import LinearCovariance
-from terrafix.cosim.plots import PREDICTED, Panel, draw_panel
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.lincov.deviations import LinearCovariance
+from terrafix.cosim.show.numbers import shown_unit
+from terrafix.cosim.show.plots import PREDICTED, Panel, draw_panel
 
 if TYPE_CHECKING:
     import xarray
 
-FloatArray = NDArray[np.float64]
 FORMATS = ("png", "svg", "pdf")
 MOST_SOURCES = 8
 _ANALYZED = "#1f77b4"

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from html import escape
 from typing import Any
 
-from terrafix.cosim.display import number, shown_unit
-from terrafix.cosim.lincov import LinearCovariance
-from terrafix.cosim.lincov_display import describe
+from terrafix.cosim.lincov.deviations import LinearCovariance
+from terrafix.cosim.lincov.display import describe
 from terrafix.cosim.report.figures import figures, render
-from terrafix.cosim.report.report import Campaign
+from terrafix.cosim.report.reading import Campaign
+from terrafix.cosim.show.numbers import number, shown_unit
 
 _STYLE = """
 :root { color-scheme: light; }

@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 import xarray
 
-from terrafix.cosim.checkpoint import read_checkpoint, write_checkpoint
-from terrafix.cosim.clock import Rate
-from terrafix.cosim.component import Component
-from terrafix.cosim.errors import ConfigurationError
-from terrafix.cosim.parameters import Parameter
-from terrafix.cosim.ports import BundleOutput, MessageOutput, Output
-from terrafix.cosim.registry import component_entries, component_type
-from terrafix.cosim.run import simulate
-from terrafix.cosim.simulation import Simulation
-from terrafix.cosim.system import System
-from terrafix.models.attitude import lvlh_quaternion_array
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import BundleOutput, MessageOutput, Output
+from terrafix.cosim.declare.registry import component_entries, component_type
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
+from terrafix.cosim.system.system import System
+from terrafix.models.motion.attitude import lvlh_quaternion_array
 
 TYPES = sorted(n for n, e in component_entries().items() if e.value.startswith("terrafix."))
 IMAGING = {  # whose inputs are images and maps: flown in test_imaging

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from terrafix.cosim.clock import Rate
-from terrafix.cosim.component import Component
-from terrafix.cosim.parameters import Parameter
-from terrafix.cosim.ports import (
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import (
     Input,
     MessageInput,
     MessageOutput,
@@ -18,8 +18,8 @@ from terrafix.cosim.ports import (
     State,
     WindowInput,
 )
-from terrafix.cosim.simulation import Simulation
-from terrafix.cosim.system import System
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.system.system import System
 
 
 class Clock(Component):

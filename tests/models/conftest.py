@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from terrafix.models.attitude import lvlh_quaternion_array
-from terrafix.models.earth import EARTH
-from terrafix.models.frames import earth_fixed_from_inertial_array
+from terrafix.models.geometry.earth import EARTH
+from terrafix.models.geometry.frames import earth_fixed_from_inertial_array
+from terrafix.models.motion.attitude import lvlh_quaternion_array
 
 # the first call builds a function, which a deadline would count; the same examples every time
 settings.register_profile("terrafix", deadline=None, derandomize=True)
@@ -77,8 +77,10 @@ def data_folder():
 
 @pytest.fixture(scope="session")
 def points():
-    """Echo of point targets, and radars to see them with (the module beside this one)."""
-    spec = importlib.util.spec_from_file_location("points", Path(__file__).with_name("points.py"))
+    """Echo of point targets, and radars to see them with (radar/points.py)."""
+    spec = importlib.util.spec_from_file_location(
+        "points", Path(__file__).with_name("radar") / "points.py"
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -1,0 +1,1 @@
+"""Who estimates: filters, and what they start from."""

@@ -1,0 +1,1 @@
+"""From echo to fix: images, references, and matching them."""

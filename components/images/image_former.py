@@ -1,0 +1,189 @@
+"""The image former: images of one echo, each formed with a member's own estimate.
+
+It reads the prior of its own instant, so that the image that corrects an estimate was formed with
+that estimate. Members whose estimates lead to the same focus share the image.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.components.fields import ACQUISITION, ESTIMATE, IMAGE
+from terrafix.components.sensors.echo import ECHO, RADAR
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Count, Flag, Parameter
+from terrafix.cosim.declare.ports import (
+    BundleInput,
+    Input,
+    MessageInput,
+    MessageOutput,
+    SharedInput,
+    SharedOutput,
+)
+from terrafix.models.geometry.antenna import boresight_direction_array, nominal_antenna_array
+from terrafix.models.geometry.geolocation import ground_point
+from terrafix.models.radar.chirp import Radar
+from terrafix.models.radar.doppler import centroid_candidates
+from terrafix.models.radar.focusing import Image
+from terrafix.models.radar.imaging import Imager, Processing, chip_slices
+from terrafix.models.radar.multilook import detected, multilook_index
+from terrafix.models.sensors.effective_velocity import effective_velocity_array
+
+_HALF_SWATH = 3000.0
+"""Slant range over which the growth of velocity is taken [m]."""
+
+Single = NDArray[np.float32]
+
+
+class ImageFormer(Component):
+    """Forms, autofocuses and detects an image about the beam's center.
+
+    Where autofocus refuses, the image is formed with the velocity that the estimate implies, and
+    comes without a measured one.
+    """
+
+    default_rate = Rate("8.2", offset="8.2")
+
+    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
+    velocity_step = Parameter(1.0, unit="m/s", positive=True, doc="grid of autofocus")
+    migration_step = Parameter(
+        50.0, unit="m/s", positive=True, doc="grid of velocities with which migration is removed"
+    )
+    band = Parameter(
+        [0.0, 1.0], shape=(2,), minimum=0.0, maximum=1.0, doc="part of the Doppler band shown"
+    )
+    exposure = Parameter(
+        1.0, positive=True, maximum=1.0, doc="share of a pulse received where columns are used"
+    )
+    azimuth_looks = Count(2, minimum=1, doc="lines averaged in a pixel")
+    range_looks = Count(1, minimum=1, doc="cells averaged in a pixel")
+    rows = Count(500, minimum=96, doc="of the detected image")
+    columns = Count(500, minimum=96, doc="of the detected image")
+    range_sigma = Parameter(1.0, unit="m", minimum=0.0, doc="noise of the slant range")
+    velocity_sigma = Parameter(
+        0.3, unit="m/s", positive=True, doc="error of the velocity beyond what the image tells"
+    )
+    show_unfocused = Flag(False, doc="publish the first member's image before autofocus, too")
+
+    radar = SharedInput(**RADAR, doc="what the radar sends and how its echo is sampled")
+    echo = SharedInput(**ECHO, doc="raw echo, lines first")
+    acquired = MessageInput(fields=ACQUISITION, doc="when and where the echo was received")
+    prior = BundleInput(ESTIMATE, doc="estimate before the fix of this instant")
+    q_be = Input((4,), unit="1", frame="b", doc="measured attitude, Earth-fixed to body")
+
+    images = SharedOutput(
+        (None, None, None), dtype=np.float32, doc="amplitudes of the distinct images"
+    )
+    unfocused = SharedOutput(
+        (None, None), dtype=np.float32, doc="the first member's, as its estimate alone forms it"
+    )
+    image = MessageOutput(fields=IMAGE, doc="which image is a member's, and what it measures")
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        fresh = self.acquired.fresh & self.environment.active
+        if not fresh.any():
+            return
+        k = int(np.argmax(fresh))
+        try:
+            imager = Imager(
+                self.echo,
+                Radar(*map(float, self.radar)),
+                float(self.acquired.near_range[k]),
+                float(self.acquired.first_time[k]),
+                step=float(self.velocity_step[k]),
+                migration_step=float(self.migration_step[k]),
+                band=(float(self.band[k, 0]), float(self.band[k, 1])),
+                exposure=float(self.exposure[k]),
+            )
+            self._form(t, imager, fresh)
+        except ValueError as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot form an image of {self.echo.shape[0]} lines of "
+                f"{self.echo.shape[1]} cells: {error}\n"
+                f"  receive more lines or cells, or set {self.name}.rows and {self.name}.columns"
+            ) from error
+
+    def _form(self, t: float, imager: Imager, fresh: NDArray[np.bool_]) -> None:
+        wavelength = imager.radar.wavelength
+        velocity, slope = self._expected_velocity(wavelength)
+        centroid, sigma = self._expected_centroid(wavelength)
+        beam_range, beam_doppler = self.acquired.beam_range, self.acquired.beam_doppler
+        chips: list[Single] = []
+        known: dict[tuple[Processing, float], int] = {}
+        values = {name: np.zeros(self.n_members) for name in IMAGE}
+        for m in np.flatnonzero(fresh):
+            processings = [
+                imager.processing(f, velocity[m], slope[m])
+                for f in centroid_candidates(
+                    imager.fraction, imager.radar.prf, centroid[m], sigma[m]
+                )
+            ]
+            processing, focus = imager.focus(processings, float(velocity[m]))
+            own = imager.step * round(velocity[m] / imager.step)
+            chosen = focus.velocity if focus.accepted else own
+            beam = float(beam_range[m]), float(beam_doppler[m])
+            image = imager.image(processing, chosen)
+            rows, columns, center = self._place(image, *beam)
+            if (processing, chosen) not in known:
+                known[processing, chosen] = len(chips)
+                chips.append(detected(image.data[rows, columns], self._looks))
+            if self.show_unfocused and m == np.flatnonzero(fresh)[0]:
+                blurred = imager.image(processing, own)
+                rows, columns, _ = self._place(blurred, *beam)
+                self.unfocused = detected(blurred.data[rows, columns], self._looks)
+            values["index"][m] = known[processing, chosen]
+            values["row"][m], values["column"][m] = center
+            values["focused"][m] = focus.accepted
+            values["velocity"][m] = chosen
+            values["velocity_sigma"][m] = np.hypot(
+                self.velocity_sigma[m], focus.sigma if focus.accepted else 0.0
+            )
+        noise = self.normals("slant_range", 1)[:, 0]
+        values["slant_range"] = beam_range + self.range_sigma * noise
+        speed = np.linalg.norm(self.prior.v_e, axis=1)
+        values["sine"] = wavelength * beam_doppler / (2 * speed)
+        self.images = np.stack(chips)
+        self.image.publish(t, valid=fresh, **values)
+
+    @property
+    def _looks(self) -> tuple[int, int]:
+        return self.azimuth_looks, self.range_looks
+
+    def _place(
+        self, image: Image, beam_range: float, beam_doppler: float
+    ) -> tuple[slice, slice, tuple[float, float]]:
+        """Lines and cells of the detected image, and where on it the beam's center lies."""
+        center = [float(x) for x in image.pixel(0.0, beam_range, beam_doppler)]
+        size = self.rows * self.azimuth_looks, self.columns * self.range_looks
+        rows, columns = chip_slices((center[0], center[1]), size, (image.rows, image.columns))
+        row = multilook_index(center[0] - rows.start, self.azimuth_looks)
+        column = multilook_index(center[1] - columns.start, self.range_looks)
+        return rows, columns, (float(row), float(column))
+
+    def _expected_velocity(self, wavelength: float) -> tuple[FloatArray, FloatArray]:
+        """Effective velocity that each estimate implies, and its growth with range."""
+        r, v = self.prior.r_e, self.prior.v_e
+        speed = np.linalg.norm(v, axis=1)
+        beam_range = np.where(self.acquired.fresh, self.acquired.beam_range, np.nan)
+        sine = wavelength * self.acquired.beam_doppler / (2 * speed)
+        found = np.full((3, self.n_members), np.nan)
+        use = self.acquired.fresh & self.environment.active
+        for i, offset in enumerate((0.0, -_HALF_SWATH, _HALF_SWATH)):
+            p = ground_point(r[use], v[use], beam_range[use] + offset, sine[use])
+            found[i, use] = effective_velocity_array(r[use], v[use], p)
+        return found[0], (found[2] - found[1]) / (2 * _HALF_SWATH)
+
+    def _expected_centroid(self, wavelength: float) -> tuple[FloatArray, FloatArray]:
+        """Doppler centroid that each estimate implies, and its standard deviation."""
+        v, P = self.prior.v_e, self.prior.P
+        q_sb = nominal_antenna_array(self.look, self.squint)
+        u = boresight_direction_array(self.q_be, q_sb, self.prior.q_mu)
+        speed2 = np.sum(v * v, axis=1)
+        variance = np.einsum("ni,nij,nj->n", u, P[:, 3:6, 3:6], u)
+        variance += speed2 * np.max(np.diagonal(P[:, 6:, 6:], axis1=1, axis2=2), axis=1)
+        return 2 / wavelength * np.sum(v * u, axis=1), 2 / wavelength * np.sqrt(variance)

@@ -1,0 +1,222 @@
+"""Geocoded references: of an earlier pass over a scene, of a recording, or from a file.
+
+A reference is one for all members, published by reference before the image that it serves.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from terrafix.components.images.matcher import AMPLITUDE, PLACES, TIES
+from terrafix.components.sensors.echo import (
+    RADAR,
+    common,
+    file_of_step,
+    generator,
+    read_lines,
+    recorded_files,
+    require_files,
+)
+from terrafix.components.truth.terrain import GRID, HEIGHT, SURFACE, dem_from, scene_from
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Count, FilePath, Parameter, Text
+from terrafix.cosim.declare.ports import Input, SharedInput, SharedOutput
+from terrafix.models.geometry.geolocation import track_axes
+from terrafix.models.images.reference import Reference, earlier_pass, geocoded, read_reference
+from terrafix.models.motion.arc import OrbitArc
+from terrafix.models.radar.boresight import boresight_on_terrain
+from terrafix.models.radar.chirp import Radar
+from terrafix.models.radar.doppler import unwrapped_centroid
+from terrafix.models.radar.footprint import Footprint
+from terrafix.models.radar.imaging import Imager
+from terrafix.models.sensors.effective_velocity import effective_velocity_array
+
+
+class _Reference(Component):
+    """Base of references: their ports."""
+
+    default_rate = Rate("8.2", offset="8.2")
+
+    amplitude = SharedOutput(**AMPLITUDE, doc="of the reference")
+    tie_rows = SharedOutput(**TIES, doc="rows of its tie points")
+    tie_columns = SharedOutput(**TIES, doc="columns of its tie points")
+    places = SharedOutput(**PLACES, doc="latitude, longitude, height of its tie points")
+
+    def _publish(self, reference: Reference) -> None:
+        self.amplitude = np.ascontiguousarray(reference.amplitude, np.float32)
+        self.tie_rows = np.asarray(reference.rows, np.float64)
+        self.tie_columns = np.asarray(reference.columns, np.float64)
+        self.places = np.stack([reference.latitude, reference.longitude, reference.height], axis=-1)
+
+
+class EarlierPass(_Reference):
+    """Reference of an earlier pass over an artificial scene, with speckle of its own.
+
+    What an ideal processor makes of the scatterers, and not formed from echo; its orbit is that
+    of the truth, displaced. It is centered where the nominal boresight meets the ground.
+    """
+
+    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
+    displacement = Parameter(
+        [0.0, 300.0, 150.0],
+        shape=(3,),
+        unit="m",
+        doc="of the earlier orbit: along the track, to the right, up",
+    )
+    n_lines = Count(4800, minimum=200, doc="lines of the reference, before averaging")
+    n_cells = Count(1500, minimum=200, doc="range cells of the reference, before averaging")
+    azimuth_looks = Count(2, minimum=1, doc="lines averaged in a pixel")
+    range_looks = Count(1, minimum=1, doc="cells averaged in a pixel")
+    snr = Parameter(10.0, doc="mean clutter over thermal noise [dB]")
+
+    radar = SharedInput(**RADAR, doc="what the radar sends and how its echo is sampled")
+    r_e = Input((3,), unit="m", frame="e", doc="true position")
+    v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
+    q_be = Input((4,), unit="1", frame="b", doc="true attitude, Earth-fixed to body")
+    height = SharedInput(**HEIGHT, doc="heights of the terrain")
+    grid = SharedInput(**GRID, doc="first point and spacing of the heights")
+    surface = SharedInput(**SURFACE, doc="texture and points of the surface")
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        radar = Radar(*map(float, self.radar))
+        r, v, q_be, look, squint, displacement, snr = (
+            common(self, name)
+            for name in ("r_e", "v_e", "q_be", "look", "squint", "displacement", "snr")
+        )
+        r = r + displacement @ track_axes(r, v)
+        reach = self.n_lines / radar.prf
+        aligned = np.array([0.0, 0.0, 0.0, 1.0])
+        scene = scene_from(self.height, self.grid, self.surface)
+        looks = self.azimuth_looks, self.range_looks
+        try:
+            beam = boresight_on_terrain(r, v, q_be, aligned, float(look), float(squint), scene.dem)
+            footprint = Footprint(
+                OrbitArc(r, v, 0.0, reach, reach),
+                radar,
+                -(self.n_lines - 1) / 2 / radar.prf,
+                self.n_lines,
+                beam.slant_range - (self.n_cells - 1) / 2 * radar.range_spacing,
+                self.n_cells,
+                beam.doppler(radar.wavelength),
+            )
+            reference = earlier_pass(scene, footprint, looks, generator(self), float(snr))
+        except ValueError as error:
+            raise ConfigurationError(f"'{self.name}' cannot see its scene: {error}") from error
+        self._publish(reference)
+
+
+class RecordedReference(_Reference):
+    """Reference formed from recorded echo, of a part of its Doppler band, and geocoded.
+
+    The velocity that focuses it is found by autofocus, once, for all. It is geocoded with the
+    true orbit, displaced in time with the recording, and the heights of the terrain.
+    """
+
+    folder = FilePath(doc="where the files are")
+    files = Text(doc="names of the files (.npz), one for each step, separated by blanks")
+    range0 = Parameter(unit="m", positive=True, doc="slant range of cell 1 of the recording")
+    start_line = Parameter(1.0, doc="line of the recording, fractional, at t = 0")
+    band = Parameter(
+        [0.0, 1.0], shape=(2,), minimum=0.0, maximum=1.0, doc="part of the Doppler band shown"
+    )
+    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
+    exposure = Parameter(
+        1.0, positive=True, maximum=1.0, doc="share of a pulse received where columns are used"
+    )
+    velocity_step = Parameter(1.0, unit="m/s", positive=True, doc="grid of autofocus")
+    azimuth_looks = Count(1, minimum=1, doc="lines averaged in a pixel")
+    range_looks = Count(1, minimum=1, doc="cells averaged in a pixel")
+
+    radar = SharedInput(**RADAR, doc="what the radar sends and how its echo is sampled")
+    r_e = Input((3,), unit="m", frame="e", doc="true position")
+    v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
+    q_be = Input((4,), unit="1", frame="b", doc="true attitude, Earth-fixed to body")
+    height = SharedInput(**HEIGHT, doc="heights of the terrain")
+    grid = SharedInput(**GRID, doc="first point and spacing of the heights")
+
+    def validate(self) -> None:
+        """Read the files."""
+        for path in recorded_files(self):
+            read_lines(self, path)
+
+    def validate_duration(self, duration: float) -> None:
+        """Look whether there is a file for every step."""
+        require_files(self, duration)
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        path = file_of_step(self)
+        lines = read_lines(self, path)
+        radar = Radar(*map(float, self.radar))
+        first_time = (lines.first_line - float(common(self, "start_line"))) / radar.prf - t
+        near = float(common(self, "range0")) + (lines.first_cell - 1) * radar.range_spacing
+        r, v, q_be, look, squint, band, step, exposure = (
+            common(self, name)
+            for name in (
+                *("r_e", "v_e", "q_be", "look", "squint"),
+                *("band", "velocity_step", "exposure"),
+            )
+        )
+        dem = dem_from(self.height, self.grid)
+        aligned = np.array([0.0, 0.0, 0.0, 1.0])
+        duration = len(lines.echo) / radar.prf
+        try:
+            beam = boresight_on_terrain(r, v, q_be, aligned, float(look), float(squint), dem)
+            imager = Imager(
+                lines.echo,
+                radar,
+                near,
+                first_time,
+                step=float(step),
+                band=(float(band[0]), float(band[1])),
+                exposure=float(exposure),
+            )
+            centroid = unwrapped_centroid(
+                imager.fraction, radar.prf, beam.doppler(radar.wavelength)
+            )
+            velocity = float(effective_velocity_array(r, v, beam.point))
+            processing = imager.processing(centroid, velocity, 0.0)
+            _, focus = imager.focus([processing], velocity)
+            image = imager.image(processing, focus.velocity if focus.accepted else velocity)
+            reach = abs(first_time) + 3 * duration
+            arc = OrbitArc(r, v, 0.0, reach, reach)
+            looks = self.azimuth_looks, self.range_looks
+            reference = geocoded(image, arc, dem.at, looks)
+        except ValueError as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot make a reference of '{path.name}': {error}"
+            ) from error
+        self._publish(reference)
+
+
+class ReferenceFile(_Reference):
+    """References from files, as `terrafix.models.images.reference.write_reference` writes them."""
+
+    folder = FilePath(doc="where the files are")
+    files = Text(doc="names of the files (.npz), one for each step, separated by blanks")
+
+    def validate(self) -> None:
+        """Read the files."""
+        for path in recorded_files(self):
+            self._read(path)
+
+    def validate_duration(self, duration: float) -> None:
+        """Look whether there is a file for every step."""
+        require_files(self, duration)
+
+    def _read(self, path: Path) -> Reference:
+        try:
+            return read_reference(path)
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot read its reference: {error}\n"
+                f"  set {self.name}.folder and {self.name}.files"
+            ) from error
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        self._publish(self._read(file_of_step(self)))

@@ -1,0 +1,1 @@
+"""Who looks on: evaluation of estimates, and albums of images."""

@@ -1,0 +1,1 @@
+"""What measures it: inertial and attitude sensors, radar, synthetic fixes."""

@@ -1,0 +1,290 @@
+"""Radar echo: simulated from the truth, or recorded, on the same ports.
+
+An echo is one for all members of an ensemble, published by reference; so the truth must be one for
+all of them. The beam's center passes its middle at the time of the step: half of the aperture lies
+ahead of that time, and is taken from the orbit that the truth will follow. (A flight system would
+apply the fix that much later; this delay is not modeled.)
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from terrafix.components.fields import ACQUISITION, RADAR_LABELS, RADAR_UNITS
+from terrafix.components.truth.terrain import GRID, HEIGHT, SURFACE, dem_from, scene_from
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.machine import require_memory
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Count, FilePath, Parameter, Text
+from terrafix.cosim.declare.ports import Input, MessageOutput, SharedInput, SharedOutput
+from terrafix.models.motion.arc import OrbitArc
+from terrafix.models.radar.boresight import Boresight, boresight_on_terrain
+from terrafix.models.radar.chirp import ComplexArray, Radar
+from terrafix.models.radar.echo import Acquisition, simulated_echo
+from terrafix.models.radar.recording import RecordedLines, read_recording
+
+RADAR: dict[str, Any] = {"shape": (6,), "unit": RADAR_UNITS, "labels": RADAR_LABELS}
+ECHO: dict[str, Any] = {"shape": (None, None), "dtype": np.complex64}
+_BEYOND = 5.0
+"""Arc beyond all apertures [s]: the corners of the surface that is looked up are seen that late."""
+
+
+class _Echo(Component):
+    """Base of radars: what they are, where they look, and their ports."""
+
+    default_rate = Rate("8.2", offset="8.2")
+
+    carrier = Parameter(unit="Hz", positive=True, doc="carrier frequency")
+    prf = Parameter(unit="Hz", positive=True, doc="pulse repetition frequency")
+    sample_rate = Parameter(unit="Hz", positive=True, doc="complex samples of a line")
+    chirp_rate = Parameter(unit="Hz/s", doc="sweep of the pulse, negative downward")
+    pulse_length = Parameter(unit="s", positive=True, doc="of the pulse")
+    doppler_bandwidth = Parameter(unit="Hz", positive=True, doc="processed, at most the prf")
+    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
+
+    r_e = Input((3,), unit="m", frame="e", doc="true position")
+    v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
+    q_be = Input((4,), unit="1", frame="b", doc="true attitude, Earth-fixed to body")
+    q_mu = Input((4,), unit="1", frame="s", doc="true misalignment")
+    height = SharedInput(**HEIGHT, doc="heights of the terrain")
+    grid = SharedInput(**GRID, doc="first point and spacing of the heights")
+
+    radar = SharedOutput(**RADAR, doc="what the radar sends and how its echo is sampled")
+    echo = SharedOutput(**ECHO, doc="raw echo, lines first")
+    acquired = MessageOutput(fields=ACQUISITION, doc="when and where the echo was received")
+
+    def validate(self) -> None:
+        """Build the radar."""
+        self._radar()
+
+    def _radar(self) -> Radar:
+        values = [np.asarray(self.setting(name)) for name in Radar.__dataclass_fields__]
+        try:
+            return Radar(*map(float, values))
+        except ValueError as error:
+            raise ConfigurationError(f"the radar of '{self.name}' cannot be: {error}") from error
+
+    def _initialize_impl(self) -> None:
+        radar = self._radar()
+        self.radar = np.array([getattr(radar, name) for name in Radar.__dataclass_fields__])
+
+    def _boresight(self) -> Boresight:
+        """Where the true boresight meets the terrain now."""
+        r, v, q_be, q_mu, look, squint = (
+            common(self, name) for name in ("r_e", "v_e", "q_be", "q_mu", "look", "squint")
+        )
+        try:
+            dem = dem_from(self.height, self.grid)
+            return boresight_on_terrain(r, v, q_be, q_mu, float(look), float(squint), dem)
+        except ValueError as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot tell where its boresight meets the ground: {error}"
+            ) from error
+
+    def _publish(self, t: float, echo: ComplexArray, first_time: float, near: float) -> None:
+        beam = self._boresight()
+        radar = self._radar()
+        reach = near + (echo.shape[1] - 1) * radar.range_spacing
+        if not near <= beam.slant_range <= reach:
+            raise ConfigurationError(
+                f"the boresight of '{self.name}' meets the ground at a slant range of "
+                f"{beam.slant_range:.0f} m, but echo was received from {near:.0f} to "
+                f"{reach:.0f} m\n"
+                f"  look at the same place: set {self.name}.look, or the orbit"
+            )
+        self.echo = echo
+        self.acquired.publish(
+            t,
+            first_time=first_time - t,
+            near_range=near,
+            beam_range=beam.slant_range,
+            beam_doppler=beam.doppler(radar.wavelength),
+        )
+
+
+class SceneEcho(_Echo):
+    """Echo of an artificial scene on a terrain, from the exact geometry of the true orbit.
+
+    Its receive window is centered on the true boresight.
+    """
+
+    antenna_length = Parameter(8.9, unit="m", positive=True, doc="along the track")
+    n_lines = Count(7452, minimum=2, doc="lines of an echo")
+    n_cells = Count(1072, minimum=2, doc="range cells of a line")
+    snr = Parameter(10.0, doc="mean clutter over thermal noise [dB]")
+
+    surface = SharedInput(**SURFACE, doc="texture and points of the surface")
+
+    def validate(self) -> None:
+        """Look whether echo of this size can be made."""
+        radar = self._radar()
+        n_lines, n_cells = self.setting("n_lines"), self.setting("n_cells")
+        if n_cells < radar.n_pulse + 64:
+            raise ConfigurationError(
+                f"'{self.name}' has lines of {n_cells} cells, and a pulse is {radar.n_pulse} "
+                f"cells long: too few are left\n  set {self.name}.n_cells to some more"
+            )
+        # an aperture of the grid is added at both ends; two layers, their sum, and transforms
+        pixels = 2.0 * n_lines * (n_cells + radar.n_pulse + 32)
+        require_memory(
+            self.name,
+            40 * pixels,
+            f"an echo of {n_lines} lines of {n_cells} cells",
+            f"set {self.name}.n_lines or {self.name}.n_cells to less",
+        )
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        radar, beam = self._radar(), self._boresight()
+        n_lines, n_cells = self.n_lines, self.n_cells
+        first_time = t - (n_lines - 1) / 2 / radar.prf
+        near = beam.slant_range - (n_cells - radar.n_pulse) / 2 * radar.range_spacing
+        r_e, v_e = common(self, "r_e"), common(self, "v_e")
+        speed2 = float(v_e @ v_e)
+        aperture = radar.prf * radar.wavelength * beam.slant_range / (2 * speed2)
+        reach = n_lines / radar.prf + aperture + _BEYOND
+        arc = OrbitArc(r_e, v_e, t, reach, reach)
+        try:
+            acquisition = Acquisition(
+                radar,
+                first_time,
+                n_lines,
+                n_cells,
+                near,
+                beam.doppler(radar.wavelength),
+                float(common(self, "antenna_length")),
+            )
+            scene = scene_from(self.height, self.grid, self.surface)
+            snr = float(common(self, "snr"))
+            echo = simulated_echo(scene, arc, acquisition, generator(self), snr_db=snr)
+        except ValueError as error:
+            raise ConfigurationError(f"'{self.name}' cannot simulate its echo: {error}") from error
+        self._publish(t, echo, first_time, near)
+
+
+class RecordedEcho(_Echo):
+    """Echo that a real radar recorded: one file for each step.
+
+    Lines of the recording are numbered; `start_line` is the one received at t = 0. The radar's
+    parameters are those of the recording, and `range0` its slant range of cell 1.
+    """
+
+    folder = FilePath(doc="where the files are")
+    files = Text(doc="names of the files (.npz), one for each step, separated by blanks")
+    range0 = Parameter(unit="m", positive=True, doc="slant range of cell 1 of the recording")
+    start_line = Parameter(1.0, doc="line of the recording, fractional, at t = 0")
+
+    def validate(self) -> None:
+        """Read the files."""
+        self._radar()
+        for path in recorded_files(self):
+            read_lines(self, path)
+
+    def validate_duration(self, duration: float) -> None:
+        """Look whether there is a file for every step, and one that was received then."""
+        for t, path in require_files(self, duration):
+            self._check_time(read_lines(self, path), path, t)
+
+    def _first_time(self, lines: RecordedLines) -> float:
+        start = float(np.ravel(self.setting("start_line"))[0])
+        return (lines.first_line - start) / float(self.setting("prf"))
+
+    def _check_time(self, lines: RecordedLines, path: Path, t: float) -> None:
+        first = self._first_time(lines)
+        last = first + (len(lines.echo) - 1) / float(self.setting("prf"))
+        if not first <= t <= last:
+            raise ConfigurationError(
+                f"'{self.name}' is to publish '{path.name}' at {t:g} s, but its lines were "
+                f"received from {first:.3f} to {last:.3f} s\n"
+                f"  list times within it, or set {self.name}.start_line"
+            )
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        path = file_of_step(self)
+        lines = read_lines(self, path)
+        self._check_time(lines, path, t)
+        near = float(common(self, "range0"))
+        near += (lines.first_cell - 1) * self._radar().range_spacing
+        self._publish(t, lines.echo, self._first_time(lines), near)
+
+
+def common(component: Component, name: str) -> FloatArray:
+    """What is the same for all active members."""
+    values = np.asarray(getattr(component, name))[component.environment.active]
+    if len(values) > 1 and np.any(values != values[:1]):
+        raise ConfigurationError(
+            f"'{component.name}.{name}' differs between members, but its output is one for all\n"
+            "  fly members with one truth: disperse what is known at the start and the sensors, "
+            "not the orbit, the attitude or the antenna; or fly one member at a time"
+        )
+    return np.asarray(values[0])
+
+
+def generator(component: Component) -> np.random.Generator:
+    """Noise of a step, one for all members: of the root seed, the component and its step alone."""
+    env = component.environment
+    words = [env.seed & 0xFFFFFFFF, env.seed >> 32, component.step_index, *env.path.encode()]
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
+
+
+def read_lines(component: Component, path: Path) -> RecordedLines:
+    """Recorded lines in a file of a component."""
+    try:
+        return read_recording(path)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(
+            f"'{component.name}' cannot read its echo: {error}\n"
+            f"  set {component.name}.folder and {component.name}.files, or TERRAFIX_DATA to the "
+            "folder with the data"
+        ) from error
+
+
+def require_files(component: Component, duration: float) -> list[tuple[float, Path]]:
+    """Time and file of every step within a run; ConfigurationError if there are too few."""
+    times, paths = steps_within(component.rate, duration), recorded_files(component)
+    if len(times) > len(paths):
+        raise ConfigurationError(
+            f"'{component.name}' steps {len(times)} times within {duration:g} s, but has "
+            f"{len(paths)} file{'s' if len(paths) != 1 else ''}\n"
+            f"  name one for each step in {component.name}.files, or list fewer times"
+        )
+    return list(zip(times, paths, strict=False))
+
+
+def file_of_step(component: Component) -> Path:
+    """File of the step that is being taken."""
+    paths = recorded_files(component)
+    if component.step_index > len(paths):
+        raise ConfigurationError(
+            f"'{component.name}' has no file for its step {component.step_index}\n"
+            f"  name one for each step in {component.name}.files"
+        )
+    return paths[component.step_index - 1]
+
+
+def recorded_files(component: Component) -> list[Path]:
+    """Files of a component with the parameters `folder` and `files`."""
+    folder: Path = component.setting("folder")
+    names = component.setting("files").replace(",", " ").split()
+    if not names:
+        raise ConfigurationError(
+            f"'{component.name}' has no file\n  name one for each step in {component.name}.files"
+        )
+    return [folder / name for name in names]
+
+
+def steps_within(rate: Rate | None, duration: float) -> list[float]:
+    """Times of the steps after t = 0 within a run [s]."""
+    if rate is None:
+        return []
+    if rate.times is not None:
+        return [float(t) for t in rate.times if 0 < t <= duration]
+    assert rate.period is not None
+    first = float(rate.offset) or float(rate.period)
+    n = int((duration - first) / float(rate.period) + 1e-9) + 1 if duration >= first else 0
+    return [first + k * float(rate.period) for k in range(n)]

@@ -1,0 +1,1 @@
+"""What really happens: orbit, attitude and terrain, computed or recorded."""

@@ -1,0 +1,318 @@
+"""Playback: a recorded orbit, attitude or IMU in the place of a simulated one, on the same ports.
+
+A result of terrafix is played sample by sample, at the times it was recorded at and to the same
+bytes; an orbit file is interpolated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.components.truth.attitude import LvlhAttitude
+from terrafix.components.truth.orbit import OrbitTruth
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError, nearest
+from terrafix.cosim.declare.component import Component, Environment
+from terrafix.cosim.declare.parameters import FilePath, Parameter, Text
+from terrafix.models.geometry.earth import EARTH
+from terrafix.models.geometry.frames import inertial_from_earth_fixed_array
+from terrafix.models.motion.ephemeris import Ephemeris, read_eof
+
+CLOSE = 1e-9  # [s] within which two times are the same: far below any step, far above rounding
+
+
+class Recording:
+    """Recorded outputs of one component of an earlier run.
+
+    Parameters
+    ----------
+    component : Component
+        Who plays them: named in errors, its ports give the shapes.
+    path : Path
+        Result file (.nc).
+    source : str
+        Path of the component in that run.
+    names : sequence of str
+        Ports that are needed.
+    optional : sequence of str
+        Ports that are played if they were recorded.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file cannot be read, or does not hold what is needed.
+    """
+
+    def __init__(
+        self,
+        component: Component,
+        path: Path,
+        source: str,
+        names: Sequence[str],
+        optional: Sequence[str] = (),
+    ) -> None:
+        from terrafix.cosim.records.results import read_result
+
+        self.component, self.path = component, path
+        try:
+            dataset = read_result(path)
+        except ConfigurationError as error:
+            raise ConfigurationError(
+                f"'{component.name}' cannot play its recording: {error}\n"
+                "  record the original in an earlier run, and name the result it was written to"
+            ) from error
+        self.members: NDArray[np.int64] = dataset["member"].to_numpy()
+        self.samples: dict[str, tuple[FloatArray, FloatArray]] = {}
+        for name in (*names, *optional):
+            key = f"{source}.{name}"
+            found = [str(v) for v in dataset.data_vars]
+            # a port may have been recorded more than once: play the one with the most samples
+            records = [v for v in found if v == key or v.startswith(f"{key}@")]
+            if not records:
+                if name in optional:
+                    continue
+                raise ConfigurationError(
+                    f"'{component.name}' needs '{key}', which '{path}' does not hold\n"
+                    f"  {nearest(key, found, what='it holds')}"
+                )
+            variable = max((dataset[v] for v in records), key=len)
+            shape = component.ports[name].single.fixed_shape
+            if variable.shape[2:] != shape:
+                raise ConfigurationError(
+                    f"'{component.name}': '{key}' has shape {variable.shape[2:]} in '{path}', "
+                    f"the port has {shape}"
+                )
+            times = dataset[str(variable.dims[0])].to_numpy()
+            self.samples[name] = times, variable.to_numpy()
+
+    def check_times(self, first: float, rate: Rate | None) -> None:
+        """Raise ConfigurationError if the first steps from `first` [s] on have no samples."""
+        if rate is None:
+            return
+        steps = list(rate.times or ())
+        if rate.period is not None:
+            steps += [rate.offset, rate.offset + rate.period]
+        for name in self.samples:
+            for t in (0.0, *map(float, steps)):
+                try:
+                    self._index(name, first + t)
+                except ConfigurationError as error:
+                    raise ConfigurationError(f"'{self.component.name}': {error}") from None
+
+    def check_end(self, last: float) -> None:
+        """Raise ConfigurationError if a port was not recorded until `last` [s]."""
+        for name, (times, _) in self.samples.items():
+            if times[-1] < last - CLOSE:
+                raise ConfigurationError(
+                    f"'{self.component.name}' is to play '{name}' until {last:g} s, but "
+                    f"'{self.path.name}' ends at {times[-1]:g} s\n"
+                    "  fly shorter (--duration), or record the original longer"
+                )
+
+    def choose(self, members: NDArray[np.int64]) -> None:
+        """Keep the members that are flown; the only one of a recording serves all."""
+        if len(self.members) == 1:
+            return
+        missing = sorted(set(members.tolist()) - set(self.members.tolist()))
+        if missing:
+            raise ConfigurationError(
+                f"'{self.component.name}': '{self.path}' does not hold member {missing[0]}\n"
+                "  record one member (it serves all), or every member that is flown"
+            )
+        order = np.argsort(self.members)
+        rows = order[np.searchsorted(self.members, members, sorter=order)]
+        self.samples = {n: (times, values[:, rows]) for n, (times, values) in self.samples.items()}
+
+    def publish(self, t: float) -> None:
+        """Put the samples of time `t` [s] on the component's ports; a member without one fails."""
+        component = self.component
+        for name in self.samples:
+            sample = self.samples[name][1][self._index(name, t)]
+            setattr(component, name, sample)
+            finite = np.isfinite(sample).reshape(len(sample), -1).all(axis=1)
+            if not finite.all():
+                component.fail(np.broadcast_to(~finite, component.n_members), "was not recorded")
+
+    def _index(self, name: str, t: float) -> int:
+        times = self.samples[name][0]
+        k = int(np.searchsorted(times, t - CLOSE))
+        if k == len(times) or abs(times[k] - t) > CLOSE:
+            span = f"from {times[0]:g} s to {times[-1]:g} s" if len(times) else "of no time"
+            raise ConfigurationError(
+                f"'{self.path.name}' has no sample of '{name}' at {t:g} s; it has {len(times)}, "
+                f"{span}\n  record the original whenever it steps, and play it at the same rate"
+            )
+        return k
+
+
+def last_step(rate: Rate | None, duration: float) -> float:
+    """Time of the last step within a run [s]; 0 if there is none."""
+    if rate is None:
+        return 0.0
+    if rate.times is not None:
+        return max((float(t) for t in rate.times if t <= duration), default=0.0)
+    assert rate.period is not None
+    period, offset = float(rate.period), float(rate.offset)
+    if duration < offset:
+        return 0.0
+    return offset + math.floor((duration - offset) / period + CLOSE) * period
+
+
+class RecordedOrbit(Component):
+    """A satellite's real or earlier orbit, on the ports of `orbit`.
+
+    From a Sentinel-1 orbit file (.EOF), whose states every 10 s are interpolated by cubic Hermite
+    polynomials, or from a result of terrafix (.nc), played sample by sample. What a file does not
+    hold is supplied: `delta_v_e` is zero, and inertial axes are the Earth-fixed ones of t = 0
+    turned by `earth_angle0`.
+    """
+
+    default_rate = Rate(hz=100)
+
+    orbit_file = FilePath(doc="orbit file (.EOF) or result (.nc)")
+    source = Text("orbit", doc="path of the component whose outputs are played (.nc)")
+    start = Parameter(
+        0.0, unit="s", minimum=0.0, doc="t = 0, after the first state (.EOF) or start (.nc)"
+    )
+    rotation_rate = Parameter(EARTH.rotation_rate, unit="rad/s", doc="Earth rotation")
+    earth_angle0 = Parameter(0.0, unit="rad", doc="inertial to Earth-fixed x axis at t = 0")
+
+    r_i = OrbitTruth.r_i
+    v_i = OrbitTruth.v_i
+    r_e = OrbitTruth.r_e
+    v_e = OrbitTruth.v_e
+    delta_v_e = OrbitTruth.delta_v_e
+
+    def validate(self) -> None:
+        """Read the file."""
+        self._read()
+
+    def _read(self) -> Ephemeris | Recording:
+        path: Path = self.setting("orbit_file")
+        hint = f"set {self.name}.orbit_file, or TERRAFIX_DATA to the folder with the data"
+        if not path.is_file():
+            what = "is a folder" if path.is_dir() else "is not there"
+            raise ConfigurationError(
+                f"'{self.name}' needs the orbit file '{path}', which {what}\n  {hint}"
+            )
+        start = float(self.setting("start"))
+        if path.suffix == ".nc":
+            optional = ("r_i", "v_i", "delta_v_e")
+            recording = Recording(self, path, self.setting("source"), ("r_e", "v_e"), optional)
+            recording.check_times(start, self.rate)
+            return recording
+        try:
+            ephemeris = read_eof(path)
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot read its orbit file: {error}\n  {hint}"
+            ) from error
+        if start >= ephemeris.t[-1]:
+            raise ConfigurationError(
+                f"'{self.name}.start' is {start:g} s, but '{path.name}' covers "
+                f"{ephemeris.t[-1]:g} s from {ephemeris.utc[0]} UTC"
+            )
+        return ephemeris
+
+    def validate_duration(self, duration: float) -> None:
+        """Read the file and look whether it covers the run."""
+        orbit, last = self._read(), float(self.setting("start")) + last_step(self.rate, duration)
+        if isinstance(orbit, Recording):
+            orbit.check_end(last)
+        elif last > orbit.t[-1]:
+            raise ConfigurationError(
+                f"'{self.name}' is to play until {last:g} s after the first state of "
+                f"'{self.setting('orbit_file').name}', which covers {orbit.t[-1]:g} s\n"
+                f"  fly shorter (--duration), or set an earlier {self.name}.start"
+            )
+
+    def bind(self, environment: Environment) -> None:
+        """Read the file."""
+        super().bind(environment)
+        self._orbit = self._read()
+        own = (self.start, self.earth_angle0, self.rotation_rate)
+        alike = all(np.ptp(p) == 0.0 for p in own)
+        if isinstance(self._orbit, Recording):
+            if np.ptp(self.start) != 0.0:
+                raise ConfigurationError(
+                    f"'{self.name}.start' differs between members: a recording is played for all "
+                    "from one time\n  disperse it with an orbit file, which is interpolated"
+                )
+            self._orbit.choose(environment.members)
+            alike = alike and len(self._orbit.members) == 1
+        # compute once for all members unless they differ
+        self._who = slice(0, 1) if alike else slice(None)
+
+    def _initialize_impl(self) -> None:
+        self._publish(0.0)
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        self._publish(t)
+
+    def _publish(self, t: float) -> None:
+        held: Mapping[str, Any] = {}
+        if isinstance(self._orbit, Recording):
+            self._orbit.publish(float(self.start[0]) + t)
+            held = self._orbit.samples
+        else:
+            self.r_e, self.v_e = self._orbit.at(self.start[self._who] + t)
+        if "r_i" not in held or "v_i" not in held:
+            rate = self.rotation_rate[self._who]
+            angle = self.earth_angle0[self._who] + rate * t
+            r_e, v_e = self.r_e[self._who], self.v_e[self._who]
+            self.r_i, self.v_i = inertial_from_earth_fixed_array(r_e, v_e, angle, rate)
+        if "delta_v_e" not in held:
+            self.delta_v_e = 0.0
+
+
+class Playback(Component):
+    """Base of playbacks of one component's outputs from a terrafix result."""
+
+    result_file = FilePath(doc="result of an earlier run (.nc)")
+    source = Text(doc="path of the component in that run whose outputs are played")
+    recorded: ClassVar[tuple[str, ...]] = ()
+
+    def validate(self) -> None:
+        """Read the file and find what is needed in it."""
+        self._read()
+
+    def validate_duration(self, duration: float) -> None:
+        """Read the file and look whether it covers the run."""
+        self._read().check_end(last_step(self.rate, duration))
+
+    def _read(self) -> Recording:
+        recording = Recording(
+            self, self.setting("result_file"), self.setting("source"), self.recorded
+        )
+        recording.check_times(0.0, self.rate)
+        return recording
+
+    def bind(self, environment: Environment) -> None:
+        """Read the recording of the members that are flown."""
+        super().bind(environment)
+        self._recording = self._read()
+        self._recording.choose(environment.members)
+
+    def _initialize_impl(self) -> None:
+        self._recording.publish(0.0)
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        self._recording.publish(t)
+
+
+class RecordedAttitude(Playback):
+    """A recorded attitude, on the ports of `lvlh_attitude`."""
+
+    default_rate = Rate(hz=100)
+    recorded = ("q_be", "delta_v_b", "delta_theta_b")
+
+    q_be = LvlhAttitude.q_be
+    delta_v_b = LvlhAttitude.delta_v_b
+    delta_theta_b = LvlhAttitude.delta_theta_b

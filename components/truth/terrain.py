@@ -1,0 +1,119 @@
+"""Terrain: an elevation model, and for simulated echo what the ground looks like to a radar."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.components.fields import GRID_LABELS, GRID_UNITS
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
+from terrafix.cosim.declare.ports import SharedOutput
+from terrafix.models.maps.dem import Dem, flat_dem, read_dem, read_jacksboro
+from terrafix.models.radar.scene import Scene
+
+SOURCES = ("file", "jacksboro", "flat")
+HEIGHT: dict[str, Any] = {"shape": (None, None), "unit": "m", "dtype": np.float32}
+GRID: dict[str, Any] = {"shape": (5,), "unit": GRID_UNITS, "labels": GRID_LABELS}
+SURFACE: dict[str, Any] = {"shape": (6,)}
+"""Ports of a terrain and of those who read them."""
+
+
+class Terrain(Component):
+    """Elevation model and surface, told once at t = 0 to all who need them.
+
+    Heights are those of the file; the undulation of the geoid is not added.
+    """
+
+    default_rate = Rate(times=["0"])
+
+    source = Choice(
+        SOURCES,
+        "file",
+        doc="file; jacksboro: the real one that comes with matplotlib; flat: one height",
+    )
+    dem_file = OptionalFilePath(doc="tile of SRTM (.hgt) or arrays (.npz)")
+    flat_height = Parameter(0.0, unit="m", doc="height everywhere (flat); 0 is the sea")
+    mirrored = Flag(False, doc="go on for ever in mirror images: artificial, without borders")
+    fill_voids = Flag(False, doc="interpolate voids instead of refusing them")
+    surface_seed = Count(0, doc="of texture and bright points")
+    parcels = Parameter(2.5, minimum=0.0, doc="texture with sharp borders, standard deviation [dB]")
+    smooth = Parameter(1.5, minimum=0.0, doc="smooth texture, standard deviation [dB]")
+    fine = Parameter(1.5, minimum=0.0, doc="fine texture, standard deviation [dB]")
+    point_density = Parameter(3.0, minimum=0.0, doc="bright points per square kilometer")
+    point_brightness = Parameter(25.0, doc="of a bright point, median, above a mean cell [dB]")
+
+    height = SharedOutput(**HEIGHT, doc="heights, southernmost row first")
+    grid = SharedOutput(**GRID, doc="first point and spacing; whether mirrored")
+    surface = SharedOutput(**SURFACE, doc="seed and strength of the texture, points")
+
+    def validate(self) -> None:
+        """Read the elevation model."""
+        self._read()
+
+    def _read(self) -> Dem:
+        source, path = self.setting("source"), self.setting("dem_file")
+        if source == "flat":
+            return flat_dem(float(self.setting("flat_height")))
+        if source == "file" and path is None:
+            raise ConfigurationError(
+                f"'{self.name}' needs an elevation model\n"
+                f"  set {self.name}.dem_file, or {self.name}.source to jacksboro or flat"
+            )
+        try:
+            dem = read_jacksboro() if source == "jacksboro" else read_dem(path)
+            dem = dem.filled() if self.setting("fill_voids") else dem
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot read its elevation model: {error}\n"
+                f"  set {self.name}.dem_file to another"
+            ) from error
+        if dem.n_void and self.setting("mirrored"):
+            raise ConfigurationError(
+                f"'{self.name}' is to mirror '{dem.name}', of which {dem.n_void} points are void\n"
+                f"  set {self.name}.fill_voids = true, or use another"
+            )
+        return dem.tiled() if self.setting("mirrored") else dem
+
+    def _initialize_impl(self) -> None:
+        dem = self._read()
+        self.height = dem.height
+        self.grid = np.array(
+            [
+                dem.latitude0,
+                dem.longitude0,
+                dem.latitude_step,
+                dem.longitude_step,
+                float(dem.mirrored),
+            ]
+        )
+        strengths = (
+            self.parcels,
+            self.smooth,
+            self.fine,
+            self.point_density,
+            self.point_brightness,
+        )
+        if any(np.ptp(s) for s in strengths):
+            raise ConfigurationError(f"the surface of '{self.name}' differs between members")
+        self.surface = np.array([float(self.surface_seed), *(float(s[0]) for s in strengths)])
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        """Say nothing more."""
+
+
+def dem_from(height: NDArray[np.float32], grid: FloatArray) -> Dem:
+    """Elevation model of the ports of a terrain, without copying it."""
+    south, west, north, east, mirrored = (float(g) for g in grid)
+    return Dem(height, south, west, north, east, mirrored=bool(mirrored))
+
+
+def scene_from(height: NDArray[np.float32], grid: FloatArray, surface: FloatArray) -> Scene:
+    """What the ground looks like to a radar, from the ports of a terrain."""
+    seed, *strengths = (float(s) for s in surface)
+    return Scene(dem_from(height, grid), int(seed), *strengths)

@@ -1,0 +1,1 @@
+"""What all else stands on: errors, exact time, units, noise, arrays, files and the machine."""

@@ -1,0 +1,1 @@
+"""What a component declares (ports, parameters, states), and the component itself."""

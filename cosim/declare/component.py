@@ -1,0 +1,335 @@
+"""The contract of a component: declared ports, states and parameters, and a life cycle.
+
+A subclass provides, in this order of need:
+
+1. declarations as class attributes (ports, parameters and states);
+2. ``_step_impl(t, dt)``: read inputs, advance states, publish outputs at time `t`;
+3. ``_initialize_impl()``: publish outputs at t = 0 (by default nothing is published);
+4. ``validate()``: raise what is wrong with its parameters, before anything runs;
+5. ``_extra_state`` / ``_set_extra_state`` where something other than declared states is kept.
+
+A component reaches for nothing but its own ports, parameters, states and `normals`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrafix.cosim.basics.arrays import FloatArray, Mask
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError, RateError, WiringError, nearest
+from terrafix.cosim.basics.noise import NormalBlocks, NormalStream
+from terrafix.cosim.declare.parameters import Parameter, Setting
+from terrafix.cosim.declare.ports import Capabilities, Declaration, Port, State
+
+ATTRIBUTES = frozenset({"name", "rate", "ports", "step_index", "kernel"})  # of every component
+KEYS = frozenset({"type", "period", "offset", "times", "doc"})  # of its table in a file
+
+
+def _own(base: type) -> bool:
+    """Whether a base class is the contract itself, whose attributes no declaration may hide."""
+    return base.__module__ in (
+        "terrafix.cosim.declare.component",
+        "terrafix.cosim.kernels.symbolic",
+    )
+
+
+@dataclass(frozen=True)
+class PortRef:
+    """A port of one component, as written ``imu["delta_v"]``."""
+
+    component: Any
+    port: str
+
+    def __str__(self) -> str:
+        return f"{self.component.name or '(unnamed)'}.{self.port}"
+
+
+@dataclass
+class Environment:
+    """What a running simulation lends a component.
+
+    Attributes
+    ----------
+    path : str
+        Where the component stands in the system, ``"nav.predict"``.
+    seed : int
+        Root seed of the ensemble.
+    members : ndarray of int64, shape (n_members,)
+        Numbers of the members flown here (a part of an ensemble keeps its numbers).
+    active : ndarray of bool, shape (n_members,)
+        Members that have not failed.
+    fail : callable
+        ``fail(mask, reason)`` excludes members from here on.
+    quiet : bool
+        Every draw of noise is zero: the nominal run, about which errors are linearized.
+    """
+
+    path: str
+    seed: int
+    members: NDArray[np.int64]
+    active: Mask
+    fail: Callable[[Mask, str], None]
+    quiet: bool = False
+
+    @property
+    def n_members(self) -> int:
+        """Number of members flown here."""
+        return len(self.members)
+
+
+class Component:
+    """Base of every component.
+
+    Parameters
+    ----------
+    rate : Rate, optional
+        When it steps; `default_rate` of the class if absent.
+    **settings
+        Declared parameters by name.
+
+    Raises
+    ------
+    ConfigurationError
+        If a name is unknown, a required parameter is absent, or a value cannot be used.
+    """
+
+    capabilities: ClassVar[Capabilities] = Capabilities()
+    default_rate: ClassVar[Rate | None] = None
+    _declared: ClassVar[dict[str, Declaration]] = {}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        declared: dict[str, Declaration] = {}
+        for base in reversed(cls.__mro__):
+            for name, value in vars(base).items():
+                if isinstance(value, Declaration):
+                    declared[name] = value
+                elif name in declared:
+                    del declared[name]  # a subclass took the name for something else
+        settings = {n for n, d in declared.items() if isinstance(d, Setting)}
+        clash = (set(declared) & ATTRIBUTES) | (settings & KEYS)
+        clash |= {n for n in declared if n.startswith("_")}
+        clash |= {n for n in declared for base in cls.__mro__ if n in vars(base) and _own(base)}
+        if clash:
+            raise TypeError(f"{cls.__name__} declares reserved names {sorted(clash)}")
+        cls._declared = declared
+
+    def __init__(self, *, rate: Rate | None = None, **settings: Any) -> None:
+        self.name = ""
+        self.rate = rate or self.default_rate
+        if self.rate is not None and not isinstance(self.rate, Rate):
+            raise RateError(
+                f"the rate of a {type(self).__name__} is {self.rate!r}\n"
+                '  write Rate("0.01") for a period, or Rate(hz=100)'
+            )
+        self.ports: dict[str, Port[Any]] = {}
+        self._views: dict[str, Any] = {}
+        self._states: dict[str, NDArray[Any]] = {}
+        self._settings: dict[str, Any] = {}
+        self._base: dict[str, Any] = {}
+        self._environment: Environment | None = None
+        self._streams: dict[tuple[str, int], NormalBlocks] = {}
+        self.step_index = 0
+        declared = self.settings()
+        for name, value in self._declared.items():
+            if isinstance(value, Port):
+                self.ports[name] = value
+        for name in settings:
+            if name not in declared:
+                raise ConfigurationError(
+                    f"{type(self).__name__} has no parameter '{name}'\n"
+                    f"  {nearest(name, declared, what='its parameters')}"
+                )
+        for name, setting in declared.items():
+            if name in settings:
+                self._set(name, settings[name])
+            elif not setting.required:
+                self._settings[name] = self._base[name] = setting.read(
+                    setting.default, where=f"default of '{name}'"
+                )
+
+    # ------------------------------------------------------------------ settings and ports
+
+    @classmethod
+    def settings(cls) -> dict[str, Setting[Any]]:
+        """Declared parameters by name."""
+        return {n: d for n, d in cls._declared.items() if isinstance(d, Setting)}
+
+    def _set(self, name: str, value: object, *, bare: bool = True) -> None:
+        if self._environment is not None:
+            raise ConfigurationError(
+                f"'{self.name}.{name}' cannot be set while a simulation runs; set it before"
+            )
+        where = f"'{self.name}.{name}'" if self.name else f"{type(self).__name__} '{name}'"
+        self._settings[name] = self._base[name] = self.settings()[name].read(
+            value, where=where, bare=bare
+        )
+
+    def setting(self, name: str) -> Any:
+        """The value that was set (for numeric parameters: before dispersions, without members)."""
+        return self._base[name]
+
+    def missing_settings(self) -> list[str]:
+        """Names of required parameters that were not given."""
+        return [n for n, s in self.settings().items() if s.required and n not in self._base]
+
+    def __getitem__(self, port: str) -> PortRef:
+        """Name a port: ``imu["delta_v"]``.
+
+        Raises
+        ------
+        WiringError
+            If there is no such port.
+        """
+        if port not in self.ports:
+            raise WiringError(
+                f"'{self.name or type(self).__name__}' has no port '{port}'\n"
+                f"  {nearest(port, self.ports, what='its ports')}"
+            )
+        return PortRef(self, port)
+
+    def inputs(self) -> dict[str, Port[Any]]:
+        """Input ports by name."""
+        return {n: p for n, p in self.ports.items() if p.is_input}
+
+    def outputs(self) -> dict[str, Port[Any]]:
+        """Output ports by name."""
+        return {n: p for n, p in self.ports.items() if not p.is_input}
+
+    # ------------------------------------------------------------------ life cycle
+
+    def prepare(self) -> None:
+        """Declare ports that depend on parameters (an FMU's, say), once these are set."""
+
+    def validate(self) -> None:
+        """Raise ConfigurationError if the parameters cannot work (files, combinations)."""
+
+    def validate_duration(self, duration: float) -> None:
+        """Raise ConfigurationError if it cannot serve a run of `duration` [s] (a recording)."""
+
+    def bind(self, environment: Environment) -> None:
+        """Get arrays for states and parameters; called once, before ports are bound."""
+        self._environment = environment
+        self.step_index = 0
+        n = environment.n_members
+        for name, declared in self._declared.items():
+            if isinstance(declared, State):
+                field = declared.field
+                self._states[name] = np.empty((n, *field.fixed_shape), dtype=field.dtype)
+                self._states[name][...] = declared.start
+            elif isinstance(declared, Parameter) and name in self._base:
+                base = np.asarray(self._base[name], dtype=np.float64)
+                self._settings[name] = np.broadcast_to(base, (n, *base.shape)).copy()
+
+    def release(self) -> None:
+        """Give back what `bind` lent; the component can be simulated again."""
+        self._environment = None
+        self._views = {}
+        self._states = {}
+        self._streams = {}
+        self._settings = dict(self._base)
+
+    @property
+    def environment(self) -> Environment:
+        """What the running simulation lends; only while one is built."""
+        if self._environment is None:
+            raise ConfigurationError(f"'{self.name}' is not part of a running simulation")
+        return self._environment
+
+    @property
+    def n_members(self) -> int:
+        """Number of ensemble members flown here."""
+        return self.environment.n_members
+
+    @property
+    def publishes_at_start(self) -> bool:
+        """Whether messages may be published at t = 0: whether 0 is one of the activations."""
+        return self.rate is not None and self.rate.starts_at_zero
+
+    @property
+    def takes_messages_at_start(self) -> bool:
+        """Whether messages of t = 0 are read at initialization, rather than by the first step.
+
+        They are where 0 is one of the activations and the component does something then.
+        """
+        acts = type(self)._initialize_impl is not Component._initialize_impl
+        return acts and self.publishes_at_start
+
+    def scheduled(self, t: float) -> float:
+        """The time of this activation as it was listed, before it was snapped to a tick at `t` [s].
+
+        For the time of validity of what a component with listed times publishes; `t` itself where
+        a period is the schedule.
+        """
+        if self.rate is None or self.rate.times is None or self.step_index == 0:
+            return t
+        return float(self.rate.times[self.step_index - (not self.rate.starts_at_zero)])
+
+    def initialize(self) -> None:
+        """Publish outputs at t = 0."""
+        self._initialize_impl()
+
+    def step(self, t: float, dt: float) -> None:
+        """Advance from ``t - dt`` to `t` [s] and publish outputs at `t`."""
+        self.step_index += 1
+        self._step_impl(t, dt)
+
+    def terminate(self) -> None:
+        """Give back files and the like at the end of a run, whether it failed or not."""
+
+    def _initialize_impl(self) -> None:
+        """Publish outputs at t = 0; override where there are any."""
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        raise NotImplementedError(f"{type(self).__name__} must provide _step_impl(t, dt)")
+
+    # ------------------------------------------------------------------ services
+
+    def normals(self, stream: str, n: int) -> FloatArray:
+        """Standard normal numbers of this step, shape (n_members, n).
+
+        They depend on the root seed, the member, this component's path, the stream's name and
+        the number of this component's step, and on nothing else: asked twice in a step, a stream
+        gives the same numbers twice.
+        """
+        if self.environment.quiet:
+            return np.zeros((self.n_members, n))
+        source = self._streams.get((stream, n))
+        if source is None:
+            if n < 1:
+                raise ValueError(f"stream '{stream}' was asked for {n} numbers")
+            env = self.environment
+            numbers = NormalStream(env.seed, env.path, stream, env.members)
+            source = self._streams[stream, n] = NormalBlocks(numbers, n)
+        return source.draw(self.step_index)
+
+    def fail(self, mask: ArrayLike, reason: str) -> None:
+        """Exclude the members in `mask` (n_members,) from here on, with a reason."""
+        self.environment.fail(np.asarray(mask, dtype=np.bool_), reason)
+
+    def get_state(self) -> dict[str, Any]:
+        """Arrays and plain values that reproduce this component."""
+        saved: dict[str, Any] = {name: array.copy() for name, array in self._states.items()}
+        extra = deepcopy(self._extra_state())
+        return {"states": saved, "step_index": self.step_index, "extra": extra}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Put back what `get_state` gave."""
+        for name, array in saved["states"].items():
+            self._states[name][...] = array
+        self.step_index = int(saved["step_index"])
+        self._set_extra_state(deepcopy(saved["extra"]))
+
+    def _extra_state(self) -> dict[str, Any]:
+        """State that is not declared: a flat dict of arrays, numbers and texts."""
+        return {}
+
+    def _set_extra_state(self, saved: dict[str, Any]) -> None:
+        """Put back what `_extra_state` gave."""

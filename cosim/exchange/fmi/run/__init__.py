@@ -1,0 +1,1 @@
+"""Anybody's FMU as a component: read, bound, stepped here or in another process."""

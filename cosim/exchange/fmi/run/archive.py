@@ -1,0 +1,216 @@
+"""FMU files: unpacked safely, read once, and refused with a reason."""
+
+from __future__ import annotations
+
+import atexit
+import shutil
+import stat
+import tempfile
+import zipfile
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+from xml.parsers import expat
+
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.exchange.fmi.run.platforms import host_platform
+
+MOST_BYTES = 4 << 30
+MOST_FILES = 20_000
+MOST_XML = 256 << 20
+
+
+@dataclass
+class Archive:
+    """An unpacked FMU.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    folder : Path
+        Where it was unpacked; removed when this process ends.
+    description : fmpy.model_description.ModelDescription
+    version : {2, 3}
+    directional : bool
+        Whether it says that it has directional derivatives.
+    annotation : Element or None
+        What terrafix wrote about the ports of an FMU of its own.
+    """
+
+    path: Path
+    folder: Path
+    description: Any
+    version: int
+    directional: bool = False
+    annotation: Any = field(default=None, repr=False)
+
+    def binary(self, identifier: str) -> Path:
+        """The binary for this machine.
+
+        Raises
+        ------
+        ConfigurationError
+            If there is none; the platforms it has are named.
+        """
+        host = host_platform()
+        names = [host.folder(self.version), host.name]
+        for name in names:
+            found = self.folder / "binaries" / name / f"{identifier}{host.suffix}"
+            if found.is_file():
+                return found
+        root = self.folder / "binaries"
+        have = sorted(p.name for p in root.iterdir() if any(p.iterdir())) if root.is_dir() else []
+        if names[0] in have:
+            raise ConfigurationError(
+                f"'{self.path}' has no file '{identifier}{host.suffix}' in binaries/{names[0]}\n"
+                "  its description names that model identifier: the archive is damaged"
+            )
+        raise ConfigurationError(
+            f"'{self.path}' has no binary for this machine, {names[0]}; it has "
+            f"{', '.join(have) or 'none'}\n  export it for this platform too"
+        )
+
+
+_opened: dict[tuple[str, int, int], Archive] = {}
+
+
+def open_archive(path: str | Path) -> Archive:
+    """Unpack an FMU and read its description; the same file is unpacked once.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is absent, no FMU, of FMI 1, damaged, or unsafe to unpack.
+    """
+    file = Path(path)
+    try:
+        status = file.stat()
+    except OSError as error:
+        raise ConfigurationError(f"cannot read '{path}': {error.strerror}") from error
+    if file.is_dir():
+        raise ConfigurationError(f"'{path}' is a folder; name an .fmu file")
+    key = (str(file.resolve()), status.st_mtime_ns, status.st_size)
+    if key not in _opened:
+        folder = Path(tempfile.mkdtemp(prefix="terrafix-fmu-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        try:
+            unpack(file, folder)
+            _opened[key] = _read(file, folder)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+    return _opened[key]
+
+
+def unpack(file: Path, folder: Path, what: str = "FMU") -> None:
+    """Unpack an archive: nothing outside `folder`, of bounded size, no links.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is no zip archive, damaged, or unsafe.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            _refuse_unsafe(file, members)
+            written = 0
+            for member in members:
+                if member.is_dir():
+                    continue
+                target = folder / PurePosixPath(member.filename)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with archive.open(member) as source, target.open("wb") as sink:
+                    while chunk := source.read(1 << 20):
+                        written += len(chunk)
+                        if written > MOST_BYTES:
+                            raise _unsafe(file, f"it unpacks to more than {MOST_BYTES >> 30} GiB")
+                        sink.write(chunk)
+    except zipfile.BadZipFile as error:
+        raise ConfigurationError(
+            f"'{file}' is no {what}: {str(error)[0].lower()}{str(error)[1:]}\n"
+            f"  an {what} is a zip archive; it may have been cut short"
+        ) from error
+    except (OSError, EOFError, NotImplementedError, RuntimeError, zlib.error) as error:
+        raise ConfigurationError(f"cannot unpack '{file}': {error}") from error
+
+
+def _refuse_unsafe(file: Path, members: list[zipfile.ZipInfo]) -> None:
+    if len(members) > MOST_FILES:
+        raise _unsafe(file, f"it holds {len(members)} files")
+    total = sum(m.file_size for m in members)
+    if total > MOST_BYTES:
+        raise _unsafe(file, f"it unpacks to {total / 2**30:.1f} GiB")
+    for member in members:
+        name = PurePosixPath(member.filename.replace("\\", "/"))
+        outside = name.is_absolute() or ".." in name.parts or ":" in member.filename
+        if outside:
+            raise _unsafe(file, f"it would write outside its folder, to '{member.filename}'")
+        if stat.S_ISLNK(member.external_attr >> 16):
+            raise _unsafe(file, f"'{member.filename}' is a link")
+
+
+def _unsafe(file: Path, why: str) -> ConfigurationError:
+    return ConfigurationError(f"'{file}' is not unpacked: {why}\n  do not trust this file")
+
+
+def checked_xml(path: Path, file: Path) -> bytes:
+    """Read XML that defines no entities and is well-formed.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is not.
+    """
+    if path.stat().st_size > MOST_XML:
+        raise _unsafe(file, f"{path.name} has {path.stat().st_size >> 20} MiB")
+    data = path.read_bytes()
+    parser = expat.ParserCreate()
+
+    def refuse(*_: object) -> None:
+        raise _unsafe(file, f"{path.name} has a document type, which could define entities")
+
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise ConfigurationError(f"'{file}': {path.name} is damaged: {error}") from error
+    return data
+
+
+def _read(file: Path, folder: Path) -> Archive:
+    from xml.etree import ElementTree as ET
+
+    xml = folder / "modelDescription.xml"
+    if not xml.is_file():
+        raise ConfigurationError(
+            f"'{file}' is no FMU: it has no modelDescription.xml at its top\n"
+            "  zip the content of the folder, not the folder"
+        )
+    root = ET.fromstring(checked_xml(xml, file))
+    version = root.get("fmiVersion", "")
+    if not version.startswith(("2.0", "3.")):
+        said = f"of FMI {version}" if version else "without a version of FMI"
+        raise ConfigurationError(
+            f"'{file}' is an FMU {said}; terrafix reads 2.0 and 3.0\n"
+            "  ask for another from the tool that wrote it"
+        )
+    from fmpy.model_description import read_model_description
+
+    try:
+        description = read_model_description(str(folder), validate=False)
+    except Exception as error:  # FMPy raises many types for what it cannot read
+        raise ConfigurationError(
+            f"'{file}': modelDescription.xml cannot be understood: {error}\n"
+            f"  terrafix check-fmu {file} says more"
+        ) from error
+    directional = any(
+        each.get(name) in ("true", "1")
+        for tag in ("CoSimulation", "ModelExchange")
+        for each in root.iter(tag)
+        for name in ("providesDirectionalDerivatives", "providesDirectionalDerivative")
+    )
+    annotation = next(root.iter("Interface"), None)
+    return Archive(file, folder, description, int(version[0]), directional, annotation)

@@ -1,0 +1,425 @@
+"""Instances of one FMU, one for each member: started, stepped, saved and freed together.
+
+Values go in and out as rows of numbers, (n_members, width), all quantities side by side. A member
+whose instance fails is reported with what the FMU said; the others go on. `Fleet` runs here,
+`terrafix.cosim.exchange.fmi.run.remote.RemoteFleet` is the same in a process of its own.
+"""
+
+from __future__ import annotations
+
+import ctypes as ct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.exchange.fmi.run.archive import open_archive
+from terrafix.cosim.exchange.fmi.run.binding import (
+    CO_SIMULATION,
+    FmuError,
+    Instance,
+    load_library,
+    references,
+)
+from terrafix.cosim.exchange.fmi.run.solvers import Integrator
+from terrafix.cosim.kernels import toolchain
+
+Failures = dict[int, str]
+"""Row of a member to what went wrong."""
+_DOUBLE = ("Real", "Float64")
+_STEP, _NOT_FINITE = 2, 4  # of `enum failure` in driver.c
+_REASONS = {
+    1: "Set: inputs were refused",
+    2: "DoStep did not succeed",
+    3: "Get: outputs could not be read",
+    5: "DoStep: the FMU asks to end the simulation, or returned early",
+}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Variables of one type, side by side in a row of numbers."""
+
+    kind: str
+    references: tuple[int, ...]
+    start: int
+    size: int
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a fleet is made from; plain values, so that it can be sent to another process.
+
+    Attributes
+    ----------
+    file : str
+    kind : str
+        Co-simulation or model exchange.
+    name : str
+        Of the component.
+    inputs, outputs : tuple of Group
+        What is set before and read after each step.
+    starts : tuple of (str, tuple of int, tuple of float)
+        Type, value references and values set before initialization.
+    solver : str
+    tolerance : float
+    """
+
+    file: str
+    kind: str
+    name: str
+    inputs: tuple[Group, ...]
+    outputs: tuple[Group, ...]
+    starts: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
+    each: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
+    solver: str = "cvode"
+    tolerance: float = 1e-10
+
+
+@dataclass(frozen=True)
+class Message:
+    """Values for some members that are set once: fields of a message, its time, its number."""
+
+    kind: str
+    references: tuple[int, ...]
+    rows: NDArray[np.int64]
+    values: FloatArray
+
+    def send(self, row: int, instance: Instance) -> None:
+        """Set them on one member's instance, if they are meant for it."""
+        at = np.flatnonzero(self.rows == row)
+        if at.size:
+            instance.set(self.kind, references(self.references), self.values[at[0]])
+
+
+class _Quick:
+    """Set, step and get of one instance, prepared for ctypes."""
+
+    def __init__(self, instance: Instance, fleet: Fleet) -> None:
+        library, row = fleet.library, fleet.instances.index(instance)
+        name = "Real" if library.version == 2 else "Float64"
+        self._instance = instance
+        self._t, self._h = ct.c_double(), ct.c_double()
+        output = fleet.outputs[row]
+        self._dot, self._zeros = output.dot, np.zeros_like(output)
+
+        def prepared(function: str, group: tuple[Group, ...], rows: FloatArray) -> tuple[Any, Any]:
+            if not group:
+                return None, ()
+            vr = fleet._references[group[0]]
+            where = ct.c_void_p(rows[row].ctypes.data)
+            arguments = [instance.pointer, vr, ct.c_size_t(len(vr)), where]
+            arguments += [] if library.version == 2 else [ct.c_size_t(rows.shape[1])]
+            called = library[function]
+            called.restype = ct.c_int
+            return called, tuple(arguments)
+
+        self._set, self._set_arguments = prepared(f"Set{name}", fleet.setup.inputs, fleet.inputs)
+        self._get, self._get_arguments = prepared(f"Get{name}", fleet.setup.outputs, fleet.outputs)
+        self._step = library["DoStep"]
+        self._step.restype = ct.c_int
+        flags, last = [ct.c_bool() for _ in range(3)], ct.c_double()
+        after: tuple[Any, ...] = (1,)
+        self._ended: tuple[Any, Any] | None = None
+        if library.version == 3:
+            after = (ct.c_bool(True), *(ct.byref(f) for f in flags), ct.byref(last))
+            self._ended = flags[1], flags[2]
+        self._step_arguments = (instance.pointer, self._t, self._h, *after)
+
+    def __call__(self, t: float, h: float) -> None:
+        self._t.value, self._h.value = t, h
+        if self._set is not None and self._set(*self._set_arguments) > 1:
+            raise FmuError(f"{_REASONS[1]}{self._instance.said()}")
+        if self._step(*self._step_arguments) > 1:
+            raise FmuError(f"{_REASONS[2]}{self._instance.said()}")
+        if self._ended is not None and (self._ended[0].value or self._ended[1].value):
+            raise FmuError(_REASONS[5])
+        if self._get is not None:
+            if self._get(*self._get_arguments) > 1:
+                raise FmuError(f"{_REASONS[3]}{self._instance.said()}")
+            if self._dot(self._zeros) != 0.0:  # NaN: something is not finite
+                raise FmuError("an output is not finite")
+
+
+class _Binding(ct.Structure):
+    """``struct binding`` of ``driver.c``."""
+
+    _fields_ = (
+        ("t", ct.c_double),
+        ("h", ct.c_double),
+        ("version", ct.c_int64),
+        ("n_members", ct.c_int64),
+        ("instance", ct.c_void_p),
+        ("active", ct.c_void_p),
+        ("failed", ct.c_void_p),
+        ("set", ct.c_void_p),
+        ("step", ct.c_void_p),
+        ("get", ct.c_void_p),
+        ("input_reference", ct.c_void_p),
+        ("output_reference", ct.c_void_p),
+        ("n_input_references", ct.c_size_t),
+        ("n_inputs", ct.c_size_t),
+        ("n_output_references", ct.c_size_t),
+        ("n_outputs", ct.c_size_t),
+        ("input", ct.c_void_p),
+        ("output", ct.c_void_p),
+    )
+
+
+class Fleet:
+    """Instances of an FMU in this process.
+
+    Parameters
+    ----------
+    setup : Setup
+    n_members : int
+
+    Attributes
+    ----------
+    inputs, outputs : ndarray, shape (n_members, width)
+        Rows that are set before and filled after each step.
+    driven : bool
+        Whether a compiled driver makes the calls.
+    """
+
+    def __init__(self, setup: Setup, n_members: int) -> None:
+        self._quick: dict[int, _Quick] = {}
+        self._live: list[int] = []
+        self._marks: dict[int, ct.c_void_p] = {}
+        self.setup = setup
+        self.archive = open_archive(setup.file)
+        self.library = load_library(self.archive, setup.kind)
+        self.inputs = np.zeros((n_members, sum(g.size for g in setup.inputs)))
+        self.outputs = np.zeros((n_members, sum(g.size for g in setup.outputs)))
+        self.instances: list[Instance | None] = [None] * n_members
+        self._integrators: dict[int, Integrator] = {}
+        self._active = np.zeros(n_members, dtype=np.uint8)
+        self._failed = np.zeros(n_members, dtype=np.uint8)
+        self._references = {g: references(g.references) for g in (*setup.inputs, *setup.outputs)}
+        self._drive: Any = None
+        self.driven = False
+
+    # ------------------------------------------------------------------ life cycle
+
+    def start(self, active: NDArray[np.bool_], messages: Sequence[Message] = ()) -> Failures:
+        """Instantiate and initialize the active members with what stands in `inputs`.
+
+        Afterwards `outputs` hold the values at t = 0.
+        """
+        failures: Failures = {}
+        for row in np.flatnonzero(active).tolist():
+            try:
+                self._start_one(row, messages)
+            except FmuError as error:
+                self._failed[row] = _STEP
+                failures[row] = str(error)
+        self._active[:] = active
+        self._live = self._find_live()
+        self._prepare_calls()
+        return failures
+
+    def _start_one(self, row: int, messages: Sequence[Message]) -> None:
+        instance = self.instances[row] = Instance(self.library, f"{self.setup.name}_{row}")
+        for kind, vr, values in self.setup.starts:
+            instance.set(kind, references(vr), values)
+        for kind, vr, values in self.setup.each:
+            instance.set(kind, references(vr), values[row])
+        instance.begin(0.0)
+        self._set_all(instance, row)
+        for message in messages:
+            message.send(row, instance)
+        instance.finish()
+        if self.setup.kind != CO_SIMULATION:
+            self._integrators[row] = Integrator(
+                instance, self.archive, 0.0, self.setup.solver, self.setup.tolerance
+            )
+        self._get_all(instance, row)
+
+    def _set_all(self, instance: Instance, row: int) -> None:
+        for group in self.setup.inputs:
+            values = self.inputs[row, group.start : group.start + group.size]
+            instance.set(group.kind, self._references[group], values)
+
+    def _get_all(self, instance: Instance, row: int) -> None:
+        for group in self.setup.outputs:
+            values = instance.get(group.kind, self._references[group], group.size)
+            self.outputs[row, group.start : group.start + group.size] = values
+        if not np.isfinite(self.outputs[row]).all():
+            raise FmuError("an output is not finite")
+
+    # ------------------------------------------------------------------ stepping
+
+    def _prepare_calls(self) -> None:
+        """Prepare calls without any conversion, where all signals are double precision.
+
+        A compiled driver makes them; where no compiler serves, this process does.
+        """
+        groups = (self.setup.inputs, self.setup.outputs)
+        real = all(len(g) <= 1 and all(x.kind in _DOUBLE for x in g) for g in groups)
+        if not real or self.setup.kind != CO_SIMULATION:
+            return
+        self._quick = {
+            row: _Quick(instance, self)
+            for row, instance in enumerate(self.instances)
+            if instance is not None
+        }
+        library = _driver()
+        if library is None:
+            return
+        pointers = (ct.c_void_p * len(self.instances))(
+            *(i.pointer.value if i is not None and i.pointer else None for i in self.instances)
+        )
+        b = _Binding(version=self.library.version, n_members=len(self.instances))
+        b.instance = ct.addressof(pointers)
+        b.active, b.failed = self._active.ctypes.data, self._failed.ctypes.data
+        name = "Real" if self.library.version == 2 else "Float64"
+        for field, function in (("set", f"Set{name}"), ("step", "DoStep"), ("get", f"Get{name}")):
+            setattr(b, field, ct.cast(self.library[function], ct.c_void_p).value)
+        for field, rows, group in zip(
+            ("input", "output"), (self.inputs, self.outputs), groups, strict=True
+        ):
+            setattr(b, field, rows.ctypes.data)
+            setattr(b, f"n_{field}s", rows.shape[1])
+            if group:
+                vr = self._references[group[0]]
+                setattr(b, f"{field}_reference", ct.addressof(vr))
+                setattr(b, f"n_{field}_references", len(vr))
+        step = library["terrafix_step_fmus"]
+        step.restype = ct.c_int64
+        self._drive = (step, b, ct.byref(b), pointers)
+        self.driven = True
+
+    def step(
+        self,
+        t: float,
+        h: float,
+        messages: Sequence[Message] = (),
+        skipped: Sequence[int] = (),
+    ) -> Failures:
+        """Set inputs, advance all from `t` by `h` [s], and fill `outputs`.
+
+        `skipped` are rows that are not stepped any more.
+        """
+        if skipped:
+            self._active[list(skipped)] = 0
+            self._live = self._find_live()
+        failures = self._send(messages) if messages else {}
+        if self._drive is not None:
+            step, b, reference, _ = self._drive
+            b.t, b.h = t, h
+            return failures | self._explain() if step(reference) else failures
+        for row in self._live:
+            try:
+                self._step_one(row, t, h)
+            except FmuError as error:
+                self._failed[row] = _STEP
+                failures[row] = str(error)
+        if failures:
+            self._live = self._find_live()
+        return failures
+
+    def _find_live(self) -> list[int]:
+        rows: list[int] = np.flatnonzero(self._active & (self._failed == 0)).tolist()
+        return rows
+
+    def _send(self, messages: Sequence[Message]) -> Failures:
+        failures: Failures = {}
+        for row in {int(r) for message in messages for r in message.rows}:
+            instance = self.instances[row]
+            try:
+                for message in messages:
+                    if instance is not None and self._active[row]:
+                        message.send(row, instance)
+            except FmuError as error:
+                self._failed[row] = _STEP
+                failures[row] = str(error)
+        return failures
+
+    def _step_one(self, row: int, t: float, h: float) -> None:
+        if quick := self._quick.get(row):
+            quick(t, h)
+            return
+        instance = self.instances[row]
+        assert instance is not None
+        self._set_all(instance, row)
+        if row in self._integrators:
+            self._integrators[row].advance(t, h)
+        else:
+            instance.step(t, h)
+        self._get_all(instance, row)
+
+    def _explain(self) -> Failures:
+        found: Failures = {}
+        for row in np.flatnonzero(self._failed * self._active).tolist():
+            code = int(self._failed[row])
+            instance = self.instances[row]
+            assert instance is not None
+            self._active[row] = 0
+            what = "an output is not finite" if code == _NOT_FINITE else (
+                f"fmi{self.library.version}{_REASONS[code]}{instance.said()}"
+            )  # fmt: skip
+            found[row] = what
+        return found
+
+    # ------------------------------------------------------------------ state
+
+    def save(self) -> list[bytes]:
+        """The state of every instance, as bytes; empty where there is none."""
+        pairs = zip(self.instances, self._failed, strict=True)
+        return [b"" if i is None or failed else i.serialize() for i, failed in pairs]
+
+    def restore(self, saved: Sequence[bytes]) -> None:
+        """Return to what `save` gave."""
+        for row, data in enumerate(saved):
+            instance = self.instances[row]
+            if data and instance is not None:
+                instance.deserialize(bytes(data))
+                if row in self._integrators:
+                    self._integrators[row].restart()
+
+    def mark(self) -> None:
+        """Keep the present state of every instance that is stepped, to return to."""
+        for row in self._live:
+            instance = self.instances[row]
+            assert instance is not None
+            self._marks[row] = instance.get_state(self._marks.get(row))
+
+    def return_to_mark(self) -> None:
+        """Set every instance back to where it was marked."""
+        for row in self._live:
+            instance = self.instances[row]
+            assert instance is not None
+            instance.set_state(self._marks[row])
+
+    def close(self) -> None:
+        """Terminate and free every instance."""
+        for row, state in self._marks.items():
+            instance = self.instances[row]
+            if instance is not None:
+                instance.free_state(state)
+        self._marks = {}
+        for row, instance in enumerate(self.instances):
+            if instance is None:
+                continue
+            self.instances[row] = None
+            try:
+                if not self._failed[row]:
+                    instance.terminate()
+            except FmuError:
+                pass  # it is freed all the same
+            instance.free()
+        self._drive = None
+
+
+@cache
+def _driver() -> Any:
+    """The compiled driver; None where no compiler serves."""
+    try:
+        return toolchain.load(Path(__file__).with_name("driver.c").read_text())
+    except toolchain.CompilationError:
+        return None

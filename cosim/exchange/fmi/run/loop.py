@@ -1,0 +1,216 @@
+"""FMUs that depend on each other within a step: steps repeated until they agree.
+
+The scheduler orders components so that nobody waits for himself, and refuses a loop of inputs read
+at the end. Where FMUs are such a loop, this component steps them together: every step is repeated
+from the same states, each time with the inputs that the others' outputs at its end imply, until
+these stand still. (With an explicit Euler step inside, that is the implicit Euler method.)
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.errors import ConfigurationError, WiringError, nearest
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Count, FileTable, Parameter, Text
+from terrafix.cosim.declare.ports import Capabilities, Input, Output, Port
+from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION
+from terrafix.cosim.exchange.fmi.run.component import Fmu, grouped
+from terrafix.cosim.exchange.fmi.run.fleet import Fleet, Setup
+from terrafix.cosim.system.wiring import check_connection, port_factor
+
+_CONNECTION = re.compile(r"\s*(\w+)\.(\w+)\s*->\s*(\w+)\.(\w+)\s*\Z")
+
+
+class FmuLoop(Component):
+    """Several FMUs for co-simulation, iterated in every step until their signals agree.
+
+    Outputs are called ``a_y`` for output y of FMU a; inputs that are not connected within
+    likewise. The FMUs must be able to get and set their state.
+    """
+
+    files = FileTable(doc="the .fmu files by name")
+    connect = Text(doc='connections within: "a.y -> b.u, b.y -> a.u"')
+    tolerance = Parameter(1e-12, positive=True, doc="of a signal, relative to one plus its size")
+    most_iterations = Count(100, minimum=1, doc="steps repeated at most so often")
+
+    def prepare(self) -> None:
+        """Read the files, and declare the ports that are not connected within."""
+        self._parts = {name: self._part(name, file) for name, file in self._base["files"].items()}
+        self._links = [
+            self._link(text) for text in self._base["connect"].split(",") if text.strip()
+        ]
+        self._factors = [
+            port_factor(self._parts[a].ports[y], self._parts[b].ports[u])
+            for a, y, b, u in self._links
+        ]
+        driven = {(b, port) for _, _, b, port in self._links}
+        self.ports = {}
+        for name, part in self._parts.items():
+            for key, port in part.ports.items():
+                if not port.is_input or (name, key) not in driven:
+                    self._declare(f"{name}_{key}", port)
+        serializes = all(p.interface.serialize for p in self._parts.values())
+        self.capabilities = Capabilities(state=serializes)  # type: ignore[misc]
+
+    def _declare(self, name: str, port: Port[Any]) -> None:
+        one = port.single
+        options: dict[str, Any] = {"unit": one.unit, "frame": one.frame, "doc": port.doc}
+        made: Port[Any] = (
+            Input(one.fixed_shape, at=port.at, default=port.default, **options)
+            if port.is_input
+            else Output(one.fixed_shape, **options)
+        )
+        made.name = name
+        self.ports[name] = made
+
+    def _part(self, name: str, file: Any) -> Fmu:
+        part = Fmu(file=file, kind=CO_SIMULATION)
+        part.name = name
+        part.prepare()
+        if not part.interface.state:
+            raise ConfigurationError(
+                f"'{self.name}': the FMU '{name}' cannot get and set its state, so its steps "
+                "cannot be repeated"
+            )
+        for key, port in part.ports.items():
+            if port.kind != "signal" or port.is_bundle or port.single.dtype != np.float64:
+                raise ConfigurationError(
+                    f"'{self.name}': port '{key}' of '{name}' is no plain signal of real numbers"
+                )
+        return part
+
+    def _link(self, text: str) -> tuple[str, str, str, str]:
+        match = _CONNECTION.match(text)
+        if match is None:
+            raise WiringError(f"'{self.name}': '{text.strip()}' is no connection: write a.y -> b.u")
+        ends = match.groups()
+        for owner, port in (ends[:2], ends[2:]):
+            if owner not in self._parts:
+                raise WiringError(
+                    f"'{self.name}' has no FMU '{owner}'\n"
+                    f"  {nearest(owner, self._parts, what='its FMUs')}"
+                )
+            if port not in self._parts[owner].ports:
+                raise WiringError(
+                    f"'{self.name}': FMU '{owner}' has no port '{port}'\n"
+                    f"  {nearest(port, self._parts[owner].ports, what='its ports')}"
+                )
+        source, target = (self._parts[o].ports[p] for o, p in (ends[:2], ends[2:]))
+        check_connection(".".join(ends[:2]), source, ".".join(ends[2:]), target)
+        return ends  # type: ignore[return-value]
+
+    # ------------------------------------------------------------------ life cycle
+
+    def _initialize_impl(self) -> None:
+        env = self.environment
+        self._fleets: dict[str, Fleet] = {}
+        self._at: dict[tuple[str, str], slice] = {}
+        for name, part in self._parts.items():
+            ports = part.interface.ports
+            read = [(p.name, "", p.fields[""][0]) for p in ports if p.is_input]
+            written = [(p.name, "", p.fields[""][0]) for p in ports if not p.is_input]
+            inputs, input_at = grouped(read)
+            outputs, output_at = grouped(written)
+            self._at |= {(name, port): at for (port, _), at in (input_at | output_at).items()}
+            file = str(part.interface.archive.path.absolute())
+            setup = Setup(file, CO_SIMULATION, f"{env.path}.{name}", inputs, outputs)
+            fleet = self._fleets[name] = Fleet(setup, env.n_members)
+            for port in part.inputs():
+                fleet.inputs[:, self._at[name, port]] = np.ravel(part.ports[port].default)
+        self._t = 0.0
+        self._outside(finite=True)
+        for name, fleet in self._fleets.items():
+            self._report(name, fleet.start(env.active.copy()))
+        self._inside()
+        self._publish()
+
+    def _outside(self, *, finite: bool = False) -> None:
+        """Take the inputs that come from outside."""
+        for name, part in self._parts.items():
+            for port in part.inputs():
+                view = self._views.get(f"{name}_{port}")
+                if view is None:
+                    continue
+                rows = view.reshape(self.n_members, -1)
+                target = self._fleets[name].inputs[:, self._at[name, port]]
+                np.copyto(target, rows, where=np.isfinite(rows) if finite else True)
+
+    def _inside(self) -> FloatArray:
+        """Hand outputs on to inputs within; by how much these change, for each member."""
+        change = np.zeros(self.n_members)
+        for (a, y, b, u), factor in zip(self._links, self._factors, strict=True):
+            values = self._fleets[a].outputs[:, self._at[a, y]]
+            values = values if factor is None else values * factor
+            target = self._fleets[b].inputs[:, self._at[b, u]]
+            change = np.maximum(
+                change, np.max(np.abs(values - target) / (1 + np.abs(values)), axis=1)
+            )
+            target[...] = values
+        return change
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        self._outside()
+        for fleet in self._fleets.values():
+            fleet.mark()
+        tolerance = self._settings["tolerance"]
+        for _ in range(self._base["most_iterations"]):
+            for name, fleet in self._fleets.items():
+                self._report(name, fleet.step(self._t, dt, (), self._gone()))
+            change = self._inside()
+            wanting = (change > tolerance) & self.environment.active
+            if not wanting.any():
+                break
+            for fleet in self._fleets.values():
+                fleet.return_to_mark()
+        else:
+            most = self._base["most_iterations"]
+            self.fail(wanting, f"signals did not settle in {most} repetitions of a step")
+        self._t = t
+        self._publish()
+
+    def _gone(self) -> list[int]:
+        rows: list[int] = np.flatnonzero(~self.environment.active).tolist()
+        return rows
+
+    def _publish(self) -> None:
+        for name, part in self._parts.items():
+            for port in part.outputs():
+                rows = self._fleets[name].outputs[:, self._at[name, port]]
+                view = self._views[f"{name}_{port}"]
+                view[...] = rows.reshape(view.shape)
+
+    def _report(self, name: str, failures: dict[int, str]) -> None:
+        for row, text in failures.items():
+            mask = np.zeros(self.n_members, dtype=np.bool_)
+            mask[row] = True
+            self.fail(mask, f"'{name}': {text}")
+
+    # ------------------------------------------------------------------ state
+
+    def terminate(self) -> None:
+        """Free the instances."""
+        for fleet in getattr(self, "_fleets", {}).values():
+            fleet.close()
+        self._fleets = {}
+
+    def _extra_state(self) -> dict[str, Any]:
+        return {
+            name: {
+                "instances": [np.frombuffer(s, dtype=np.uint8) for s in fleet.save()],
+                "inputs": fleet.inputs.copy(),
+                "outputs": fleet.outputs.copy(),
+            }
+            for name, fleet in self._fleets.items()
+        } | {"t": self._t}
+
+    def _set_extra_state(self, saved: dict[str, Any]) -> None:
+        for name, fleet in self._fleets.items():
+            kept = saved[name]
+            fleet.restore([np.asarray(s, dtype=np.uint8).tobytes() for s in kept["instances"]])
+            fleet.inputs[...], fleet.outputs[...] = kept["inputs"], kept["outputs"]
+        self._t = float(saved["t"])

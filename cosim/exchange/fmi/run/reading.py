@@ -1,0 +1,318 @@
+"""From a model description to ports, parameters and capabilities.
+
+An FMU that terrafix exported says in an annotation which variables form a port, what kind it is,
+its frames and when inputs are read. Of any other FMU, scalars called ``r[1]``, ``r[2]``, ... that
+belong together form an array port, everything else is a port of its own; names that are no
+identifiers are written with underscores.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.units import check_unit
+from terrafix.cosim.exchange.fmi.run.archive import Archive
+from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
+from terrafix.cosim.memory.fields import Field, Unit
+
+REAL = ("Real", "Float64", "Float32")
+BOOLEAN = ("Boolean",)
+INTEGER = (
+    *("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16"),
+    *("Int32", "UInt32", "Int64", "UInt64"),
+)
+_ELEMENT = re.compile(r"(.+)\[(\d+(?:,\d+)*)\]\Z")
+
+
+@dataclass
+class Quantity:
+    """One or several variables of an FMU that are a number or an array together.
+
+    Attributes
+    ----------
+    name : str
+        As the FMU has it, without indices.
+    kind : str
+        Type of the variables: ``Float64``, ``Real``, ...
+    references : list of int
+        Value references: one of an FMI 3 array, one for each scalar.
+    shape : tuple of int
+    unit : str or tuple of str
+    start : list of float or None
+    causality, variability : str
+    doc : str
+    base : int
+        Index of the first element, in names.
+    """
+
+    name: str
+    kind: str
+    references: list[int]
+    shape: tuple[int, ...]
+    unit: Unit = "1"
+    start: list[float] | None = None
+    causality: str = "local"
+    variability: str = "continuous"
+    doc: str = ""
+    base: int = 1
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    def scalars(self) -> list[str]:
+        """Names of its elements as FMI 2 has them: ``r[1]``, ``P[1,2]``."""
+        if not self.shape:
+            return [self.name]
+        return [
+            f"{self.name}[{','.join(str(i + self.base) for i in index)}]"
+            for index in np.ndindex(self.shape)
+        ]
+
+    def field(self, frame: str | None = None) -> Field:
+        """The port's field for it."""
+        dtype: Any = np.float64
+        if self.kind in BOOLEAN:
+            dtype = np.bool_
+        elif self.kind in INTEGER:
+            dtype = np.int64
+        return Field(self.shape, self.unit, frame, dtype, doc=self.doc)
+
+
+@dataclass
+class ImportedPort:
+    """A port and the variables behind it.
+
+    Attributes
+    ----------
+    name : str
+    kind : {"signal", "message"}
+    is_input : bool
+    at : {"start", "end"} or None
+        None where the FMU does not say.
+    fields : dict of str to (Quantity, frame)
+    t, sequence : Quantity or None
+        Of a message.
+    """
+
+    name: str
+    kind: str
+    is_input: bool
+    at: str | None
+    fields: dict[str, tuple[Quantity, str | None]] = field(default_factory=dict)
+    t: Quantity | None = None
+    sequence: Quantity | None = None
+
+
+@dataclass
+class Interface:
+    """What terrafix needs to know of an FMU.
+
+    Attributes
+    ----------
+    archive : Archive
+    kind : str
+        ``"co-simulation"`` or ``"model exchange"``: how it is run.
+    ports : list of ImportedPort
+    parameters : dict of str to Quantity
+    left_out : list of str
+        Inputs and outputs of types that have no port (text, binary, clocks).
+    state, serialize : bool
+        Whether its state can be got and set, and written as bytes.
+    own : bool
+        Whether terrafix wrote it.
+    """
+
+    archive: Archive
+    kind: str
+    ports: list[ImportedPort]
+    parameters: dict[str, Quantity]
+    left_out: list[str]
+    state: bool
+    serialize: bool
+    own: bool
+
+
+def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True) -> Interface:
+    """Read ports, parameters and capabilities; without `arrays`, every scalar is a port.
+
+    Raises
+    ------
+    ConfigurationError
+        If it does not offer `kind`, or a port cannot be made of it.
+    """
+    description = archive.description
+    offered = []
+    if description.coSimulation is not None:
+        offered.append(CO_SIMULATION)
+    if description.modelExchange is not None:
+        offered.append(MODEL_EXCHANGE)
+    if not offered:
+        raise ConfigurationError(
+            f"'{archive.path}' offers neither co-simulation nor model exchange\n"
+            "  terrafix does not run scheduled execution"
+        )
+    chosen = offered[0] if kind == "auto" else kind
+    if chosen not in offered:
+        raise ConfigurationError(
+            f"'{archive.path}' offers {' and '.join(offered)}, not {kind}\n"
+            f'  write kind = "{offered[0]}", or leave it out'
+        )
+    interface = description.coSimulation if chosen == CO_SIMULATION else description.modelExchange
+    quantities, left_out = _quantities(archive, arrays=arrays)
+    found = archive.annotation if arrays else None
+    ports = _own_ports(archive, found, quantities) if found is not None else _ports(quantities)
+    return Interface(
+        archive,
+        chosen,
+        ports,
+        {q.name: q for q in quantities if q.causality in ("parameter", "structuralParameter")},
+        left_out,
+        bool(interface.canGetAndSetFMUstate),
+        bool(interface.canGetAndSetFMUstate and interface.canSerializeFMUstate),
+        own=archive.annotation is not None,
+    )
+
+
+# --------------------------------------------------------------------------------- variables
+
+
+def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list[str]]:
+    """Inputs, outputs and parameters, elements of arrays together."""
+    wanted = ("input", "output", "parameter", "structuralParameter")
+    groups: dict[tuple[str, str], list[tuple[tuple[int, ...], Any]]] = {}
+    left_out = []
+    for variable in archive.description.modelVariables:
+        if variable.causality not in wanted:
+            continue
+        if variable.type not in (*REAL, *INTEGER, *BOOLEAN):
+            if variable.causality in ("input", "output"):
+                left_out.append(variable.name)
+            continue
+        match = None if not arrays or variable.dimensions else _ELEMENT.match(variable.name)
+        name = match[1] if match else variable.name
+        index = tuple(int(i) for i in match[2].split(",")) if match else ()
+        groups.setdefault((name, variable.causality), []).append((index, variable))
+    quantities = []
+    for (name, _), members in groups.items():
+        members.sort(key=lambda pair: pair[0])
+        shape = _extent([index for index, _ in members])
+        same = len({(v.type, v.variability) for _, v in members}) == 1
+        if shape is not None and same:
+            made = _quantity(name, shape, [v for _, v in members])
+            made.base = min(min(index) for index, _ in members) if shape else 1
+            quantities.append(made)
+        else:
+            quantities += [_quantity(v.name, (), [v]) for _, v in members]
+    return quantities, left_out
+
+
+def _extent(indices: Sequence[tuple[int, ...]]) -> tuple[int, ...] | None:
+    """Shape that the indices fill, from 1 (or 0) on; None if they do not."""
+    if indices == [()]:
+        return ()
+    if len({len(i) for i in indices}) != 1 or not indices[0]:
+        return None
+    low = np.min(indices, axis=0)
+    shape = tuple(int(n) for n in np.max(indices, axis=0) - low + 1)
+    full = [tuple(int(k) for k in np.array(i) + low) for i in np.ndindex(shape)]
+    return shape if list(indices) == full and low.max() <= 1 else None
+
+
+def _quantity(name: str, shape: tuple[int, ...], members: Sequence[Any]) -> Quantity:
+    first = members[0]
+    if first.dimensions or first.shape:
+        shape = tuple(int(n) for n in (first.shape or ()))
+    units = tuple(_unit(v) for v in members)
+    unit: Unit = units[0] if len(set(units)) == 1 else units
+    if len(shape) == 2 and not isinstance(unit, str):
+        last = units[: shape[-1]]
+        unit = last if units == last * shape[0] else "1"
+    return Quantity(
+        name,
+        first.type,
+        [int(v.valueReference) for v in members],
+        shape,
+        unit,
+        _starts(members),
+        first.causality,
+        first.variability or "continuous",
+        " ".join((first.description or "").split()),
+    )
+
+
+def _unit(variable: Any) -> str:
+    unit = variable.unit
+    if unit is None and variable.declaredType is not None:
+        unit = variable.declaredType.unit
+    if unit is None or unit in ("", "-"):
+        return "1"
+    try:
+        check_unit(unit)
+    except ConfigurationError:
+        return "1"
+    return str(unit)
+
+
+def _starts(members: Sequence[Any]) -> list[float] | None:
+    texts = [v.start for v in members]
+    if any(t is None for t in texts):
+        return None
+    words: list[str] = []
+    for text in texts:
+        if isinstance(text, str):
+            words += text.split()
+        else:
+            words += [str(x) for x in np.asarray(text).ravel()]
+    return [1.0 if w == "true" else 0.0 if w == "false" else float(w) for w in words]
+
+
+# --------------------------------------------------------------------------------- ports
+
+
+def _ports(quantities: Iterable[Quantity]) -> list[ImportedPort]:
+    ports, taken = [], set[str]()
+    for q in quantities:
+        if q.causality not in ("input", "output"):
+            continue
+        name = re.sub(r"\W+", "_", q.name).strip("_") or "port"
+        name = name if not name[0].isdigit() else f"v{name}"
+        while name in taken:
+            name += "_"
+        taken.add(name)
+        port = ImportedPort(name, "signal", q.causality == "input", None)
+        port.fields[""] = (q, None)
+        ports.append(port)
+    return ports
+
+
+def _own_ports(archive: Archive, interface: Any, quantities: list[Quantity]) -> list[ImportedPort]:
+    """Ports by the annotation of an FMU of terrafix."""
+    by_name = {q.name: q for q in quantities}
+    ports = []
+    for element in interface.iter("Port"):
+        is_input = "at" in element.attrib
+        port = ImportedPort(element.get("name"), element.get("kind"), is_input, element.get("at"))
+        for each in element.iter("Field"):
+            variable = each.get("variable")
+            if variable not in by_name:
+                raise ConfigurationError(
+                    f"'{archive.path}': its annotation names '{variable}', which is no variable\n"
+                    "  the description was changed after it was exported"
+                )
+            quantity = by_name[variable]
+            if each.get("units"):
+                quantity.unit = tuple(each.get("units").split("|"))
+            port.fields[each.get("name", "")] = (quantity, each.get("frame"))
+        if port.kind == "message":
+            port.t = by_name[f"{port.name}.t"]
+            port.sequence = by_name[f"{port.name}.sequence"]
+        ports.append(port)
+    return ports

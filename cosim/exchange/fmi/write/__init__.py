@@ -1,0 +1,1 @@
+"""Components and systems written as FMUs: description, C sources, binaries."""

@@ -1,0 +1,1 @@
+"""Systems written as SSP packages, and read from them."""

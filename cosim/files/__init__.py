@@ -1,0 +1,1 @@
+"""System files: a reader for each suffix, and the writer."""

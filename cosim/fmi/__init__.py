@@ -1,1 +1,0 @@
-"""Functional Mock-up Units: export of symbolic components, import and checks of anybody's."""

@@ -1,0 +1,1 @@
+"""How symbolic components are stepped: compiled, vectorized, or by CasADi itself."""

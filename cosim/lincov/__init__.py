@@ -1,0 +1,1 @@
+"""Linear covariance analysis: a campaign predicted from one run."""

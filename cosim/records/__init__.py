@@ -1,0 +1,1 @@
+"""What a run leaves: records, results, checkpoints, and the places that keep them."""

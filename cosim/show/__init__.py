@@ -1,0 +1,1 @@
+"""How numbers, tables and figures look to a person; knows data, not systems."""

@@ -1,1 +1,0 @@
-"""System Structure and Parameterization: systems exchanged as packages of FMUs."""

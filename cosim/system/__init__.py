@@ -1,0 +1,1 @@
+"""A system of components: built, wired, dispersed, ordered, checked and drawn."""

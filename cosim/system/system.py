@@ -1,0 +1,367 @@
+"""A system: components, connections, exposed ports, records and dispersions; nestable.
+
+    with System("coast") as system:
+        orbit = system.add(OrbitTruth(...), name="orbit")
+        imu = system.add(Imu(...), name="imu")
+        system.connect(orbit["delta_v_e"], imu["delta_v_true"])
+
+The same object comes from a system file (`terrafix.read_system`); both roads raise the same errors.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from typing import Any, Self, TypeVar
+
+from terrafix.cosim.basics.clock import Exact, Rate, seconds
+from terrafix.cosim.basics.errors import (
+    ConfigurationError,
+    RateError,
+    TerrafixError,
+    WiringError,
+    nearest,
+)
+from terrafix.cosim.declare.component import Component, PortRef
+from terrafix.cosim.declare.ports import Port
+from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.flat import Connection, FlatSystem, Record
+from terrafix.cosim.system.wiring import check_connection
+
+TABLES = frozenset({"component", "wiring", "expose", "record", "dispersion", "choice"})
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
+Node = TypeVar("Node", bound="Component | System")
+
+
+class System:
+    """Components and what connects them.
+
+    Parameters
+    ----------
+    name : str
+        An identifier.
+    doc : str
+        What the system is for.
+    duration : exact time, optional
+        How long a run lasts unless told otherwise [s].
+    members : int
+        Size of the ensemble unless told otherwise.
+    seed : int
+        Root seed unless told otherwise.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        doc: str = "",
+        duration: Exact | None = None,
+        members: int = 1,
+        seed: int = 0,
+    ) -> None:
+        self.name = _checked_name(name, "system")
+        self.doc = doc
+        self.duration = None if duration is None else _positive(duration, "duration")
+        self.members = members
+        self.seed = seed
+        self.nodes: dict[str, Component | System] = {}
+        self.connections: list[Connection] = []
+        self.exposed: dict[str, str] = {}
+        self.records: list[Record] = []
+        self.dispersions: list[Dispersion] = []
+        self._contained = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Nothing to undo: the ``with`` block only groups what belongs together."""
+
+    # ------------------------------------------------------------------ building
+
+    def add(self, node: Node, name: str) -> Node:
+        """Add a component or a system under a name, and return it.
+
+        Raises
+        ------
+        ConfigurationError
+            If the name is no identifier or is taken, or the node belongs to a system already.
+        """
+        _checked_name(name, "component")
+        if not isinstance(node, Component | System):
+            what = f"the class {node.__name__}" if isinstance(node, type) else repr(node)
+            raise ConfigurationError(f"cannot add {what} as '{name}': make a component of it first")
+        if name in TABLES:
+            raise ConfigurationError(
+                f"'{name}' cannot name a component: it is a table of system files"
+            )
+        if name in self.nodes:
+            raise ConfigurationError(f"system '{self.name}' has a component '{name}' already")
+        if isinstance(node, Component):
+            if node.name:
+                raise ConfigurationError(
+                    f"this {type(node).__name__} is '{node.name}' already; make another one"
+                )
+            node.name = name
+            if not node.missing_settings():
+                node.prepare()
+        else:
+            if self in node._systems():
+                raise ConfigurationError(f"system '{self.name}' cannot contain itself")
+            if node._contained:
+                raise ConfigurationError(
+                    f"system '{node.name}' is part of a system already; make another one"
+                )
+            node.name, node._contained = name, True
+        self.nodes[name] = node
+        return node
+
+    def __getitem__(self, port: str) -> PortRef:
+        """Name an exposed port of this system: ``nav["fix"]``."""
+        if port not in self.exposed:
+            raise WiringError(
+                f"system '{self.name}' exposes no port '{port}'\n"
+                f"  {nearest(port, self.exposed, what='exposed ports')}"
+            )
+        return PortRef(self, port)
+
+    def expose(self, name: str, port: PortRef | str) -> None:
+        """Make a port of a component a port of this system."""
+        _checked_name(name, "port")
+        path = self._path(port)
+        self.resolve(path)
+        self.exposed[name] = path
+
+    def connect(self, source: PortRef | str, target: PortRef | str, *, delay: Exact = 0) -> None:
+        """Connect an output to an input, optionally with a delay [s].
+
+        Raises
+        ------
+        WiringError
+            If a port does not exist, the two do not fit, or the input has a driver already.
+        RateError
+            If the delay is negative or not exact.
+        """
+        source_path, target_path = self._path(source), self._path(target)
+        wrong, found = [], []
+        for path in (source_path, target_path):
+            try:
+                found.append(self.resolve(path))
+            except WiringError as error:
+                wrong.append(f"  {error}")
+        if wrong:
+            raise WiringError(
+                "\n".join([f"cannot connect '{source_path}' to '{target_path}'", *wrong])
+            )
+        (_, source_port), (target_leaf, target_port) = found
+        check_connection(source_path, source_port, target_path, target_port)
+        for other in self.connections:
+            if self.resolve(other.target)[0] == target_leaf:
+                raise WiringError(
+                    f"input '{target_path}' has two drivers\n"
+                    f"  '{other.source}' is connected to it already\n"
+                    f"  '{source_path}' cannot be connected too: remove one of them"
+                )
+        exact = seconds(delay, f"delay of '{source_path} -> {target_path}'")
+        if exact < 0:
+            raise RateError(
+                f"delay of '{source_path} -> {target_path}' is negative\n"
+                "  a connection hands on what was published, never what will be"
+            )
+        if exact and (target_port.kind == "shared" or target_port.window):
+            raise WiringError(
+                f"cannot delay '{source_path} -> {target_path}': only signals and messages carry "
+                "a delay, not shared values or windows"
+            )
+        self.connections.append(Connection(source_path, target_path, exact))
+
+    def record(
+        self,
+        name: str,
+        ports: PortRef | str | Sequence[PortRef | str],
+        *,
+        period: Exact | None = None,
+        rate: Rate | None = None,
+    ) -> None:
+        """Record ports at a period or rate, or whenever their one component steps."""
+        _checked_name(name, "record")
+        if any(r.name == name for r in self.records):
+            raise ConfigurationError(f"system '{self.name}' has a record '{name}' already")
+        if period is not None:
+            rate = Rate(period)
+        listed = [ports] if isinstance(ports, PortRef | str) else ports
+        paths = tuple(self._path(p) for p in listed)
+        if not paths:
+            raise ConfigurationError(f"record '{name}' names no ports")
+        self.records.append(Record(name, paths, rate))
+
+    def disperse(self, dispersion: Dispersion) -> None:
+        """Add a dispersion of parameters."""
+        if any(d.name == dispersion.name for d in self.dispersions):
+            raise ConfigurationError(
+                f"system '{self.name}' has a dispersion '{dispersion.name}' already"
+            )
+        self.dispersions.append(dispersion)
+
+    def remove(self, name: str) -> None:
+        """Remove a component with its connections (to put another in its place)."""
+        if name not in self.nodes:
+            raise ConfigurationError(
+                f"system '{self.name}' has no component '{name}'\n"
+                f"  {nearest(name, self.nodes, what='components')}"
+            )
+        node = self.nodes.pop(name)
+        if isinstance(node, Component):
+            node.name = ""
+        else:
+            node._contained = False
+        self.connections = [
+            c
+            for c in self.connections
+            if name not in (c.source.split(".")[0], c.target.split(".")[0])
+        ]
+
+    def _systems(self) -> Iterator[System]:
+        """Yield this system and all systems within."""
+        yield self
+        for node in self.nodes.values():
+            if isinstance(node, System):
+                yield from node._systems()
+
+    def replace(self, name: str, node: Node) -> Node:
+        """Put another component in the place of one, on the same ports, and return it.
+
+        What the old one read is connected where the new one has that input too; everything that
+        others read from it must be there.
+
+        Raises
+        ------
+        ConfigurationError
+            If there is no such component.
+        WiringError
+            If a port that is read is missing or does not fit.
+        """
+        nodes, connections = dict(self.nodes), list(self.connections)
+        self.remove(name)
+        try:
+            self.add(node, name)
+            self.connections = []
+            for c in connections:
+                owner, _, port = c.target.partition(".")
+                if owner == name and isinstance(node, Component) and port not in node.inputs():
+                    continue
+                self.connect(c.source, c.target, delay=c.delay)
+        except TerrafixError:
+            if isinstance(node, Component):
+                node.name = ""
+            self.nodes, self.connections = nodes, connections
+            if isinstance(old := nodes[name], Component):
+                old.name = name
+            raise
+        return node
+
+    def _path(self, port: PortRef | str) -> str:
+        if isinstance(port, str):
+            return port
+        if not isinstance(port, PortRef):
+            raise WiringError(
+                f'{type(port).__name__} is no port\n  name one of its ports: part["port"]'
+            )
+        for name, node in self.nodes.items():
+            if node is port.component:
+                return f"{name}.{port.port}"
+        raise WiringError(f"'{port}' belongs to no component of system '{self.name}'; add it first")
+
+    # ------------------------------------------------------------------ reading
+
+    def resolve(self, path: str) -> tuple[str, Port[Any]]:
+        """Follow exposed ports down to (path of the component's port, port).
+
+        Raises
+        ------
+        WiringError
+            If the path names no component or no port.
+        """
+        parts = path.split(".")
+        if len(parts) < 2:
+            raise WiringError(f"'{path}' is no port; write 'component.port'")
+        head, rest = parts[0], parts[1:]
+        if head not in self.nodes:
+            raise WiringError(
+                f"there is no component '{head}' in '{path}'\n"
+                f"  {nearest(head, self.nodes, what='components')}"
+            )
+        node = self.nodes[head]
+        if isinstance(node, System):
+            inner = node.exposed.get(rest[0]) if len(rest) == 1 else ".".join(rest)
+            if inner is None:
+                node[rest[0]]  # raises: names what is exposed
+                raise AssertionError
+            leaf, port = node.resolve(inner)
+            return f"{head}.{leaf}", port
+        if len(rest) != 1:
+            raise WiringError(f"'{path}' is no port; write 'component.port'")
+        return path, node[rest[0]].component.ports[rest[0]]
+
+    def find(self, path: str) -> Component:
+        """The component at a path; ConfigurationError if there is none."""
+        flat = self.flatten()
+        if path not in flat.components:
+            raise ConfigurationError(
+                f"there is no component '{path}'\n"
+                f"  {nearest(path, flat.components, what='components')}"
+            )
+        return flat.components[path]
+
+    def _resolved(self, record: Record) -> Record:
+        """A record with exposed ports followed down; what does not exist is left to the check."""
+
+        def leaf(path: str) -> str:
+            try:
+                return self.resolve(path)[0]
+            except WiringError:
+                return path
+
+        return Record(record.name, tuple(leaf(p) for p in record.ports), record.rate)
+
+    def flatten(self) -> FlatSystem:
+        """Resolve nesting: every component by path, every connection between their ports."""
+        flat = FlatSystem(self.name, {}, [])
+        for name, node in self.nodes.items():
+            if isinstance(node, Component):
+                flat.components[name] = node
+                continue
+            inner = node.flatten()
+            flat.components |= {f"{name}.{path}": c for path, c in inner.components.items()}
+            flat.connections += [
+                Connection(f"{name}.{c.source}", f"{name}.{c.target}", c.delay)
+                for c in inner.connections
+            ]
+            flat.records += [
+                Record(f"{name}_{r.name}", tuple(f"{name}.{p}" for p in r.ports), r.rate)
+                for r in inner.records
+            ]
+            flat.dispersions += [d.below(name) for d in inner.dispersions]
+        flat.connections += [
+            Connection(self.resolve(c.source)[0], self.resolve(c.target)[0], c.delay)
+            for c in self.connections
+        ]
+        flat.records += [self._resolved(record) for record in self.records]
+        flat.dispersions += self.dispersions
+        return flat
+
+
+def _checked_name(name: str, what: str) -> str:
+    if not isinstance(name, str) or not _NAME.match(name):
+        raise ConfigurationError(
+            f"'{name}' cannot name a {what}: use letters, digits and underscores, a letter first"
+        )
+    return name
+
+
+def _positive(value: Exact, what: str) -> Fraction:
+    exact = seconds(value, what)
+    if exact <= 0:
+        raise RateError(f"{what} is {value}; it must be positive")
+    return exact

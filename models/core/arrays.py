@@ -1,0 +1,60 @@
+"""The alias for arrays of real numbers, and named arrays in files of NumPy (.npz).
+
+Files are read with errors that say what is wrong with the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+"""The one alias for arrays of real numbers."""
+
+
+def read_arrays(
+    path: Path, keys: Sequence[str], what: str, optional: Sequence[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Read arrays from a file (.npz).
+
+    Parameters
+    ----------
+    path : Path
+    keys : sequence of str
+        Arrays that it must hold.
+    what : str
+        What the file is, for errors: "an echo".
+    optional : sequence of str
+        Arrays that are read if it holds them.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is not a file of arrays, is damaged, or lacks some.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"'{path}' {'is a folder' if path.is_dir() else 'is not there'}")
+    try:
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
+            if not hasattr(archive, "files"):
+                raise ValueError("it holds one array without a name")
+            missing = [k for k in keys if k not in archive.files]
+            if missing:
+                raise ValueError(
+                    f"it has no '{missing[0]}'; it holds {', '.join(archive.files) or 'nothing'}"
+                )
+            return {k: archive[k] for k in (*keys, *optional) if k in archive.files}
+    except (OSError, EOFError, BadZipFile, ValueError, KeyError) as error:
+        reason = str(error) if isinstance(error, ValueError) else f"it is damaged ({error})"
+        raise ValueError(
+            f"'{path}' is not {what}: {reason}\n  {what} is a file of NumPy (.npz) with the arrays "
+            f"{', '.join(keys)}"
+        ) from error

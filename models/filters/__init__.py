@@ -1,0 +1,1 @@
+"""Navigation filters: states, propagation, updates, and whether they are consistent."""

@@ -1,0 +1,1 @@
+"""References of the ground, and how one image is found on another."""

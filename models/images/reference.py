@@ -1,0 +1,205 @@
+"""A geocoded reference: an amplitude image of which every pixel has a place on Earth.
+
+Places are given at tie points, on some rows and columns, and interpolated between; so an image in
+the slant geometry of an earlier pass and a map serve alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from terrafix.models.core.arrays import FloatArray, read_arrays
+from terrafix.models.geometry.geodesy import geodetic
+from terrafix.models.geometry.geolocation import Height, ground_point_on_terrain
+from terrafix.models.motion.arc import OrbitArc
+from terrafix.models.radar.echo import ideal_image
+from terrafix.models.radar.focusing import Image
+from terrafix.models.radar.footprint import Footprint, TerrainGrid
+from terrafix.models.radar.multilook import detected, full_index, multilook_index
+from terrafix.models.radar.scene import Scene, Single
+
+KEYS = ("amplitude", "rows", "columns", "latitude_deg", "longitude_deg", "height_m")
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A geocoded amplitude image.
+
+    Parameters
+    ----------
+    amplitude : ndarray of float32, shape (n_rows, n_columns)
+    rows, columns : ndarray, shape (n_i,) and (n_j,)
+        Rows and columns of the tie points, fractional, increasing.
+    latitude, longitude, height : ndarray, shape (n_i, n_j)
+        Places of the tie points: [rad], [rad], and [m] above the ellipsoid.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, or something is not finite.
+    """
+
+    amplitude: Single
+    rows: FloatArray
+    columns: FloatArray
+    latitude: FloatArray
+    longitude: FloatArray
+    height: FloatArray
+
+    def __post_init__(self) -> None:
+        if self.amplitude.ndim != 2:
+            raise ValueError(f"a reference is an image, got shape {self.amplitude.shape}")
+        ties = (len(self.rows), len(self.columns))
+        if min(ties) < 2:
+            raise ValueError(f"a reference needs two rows and columns of tie points, got {ties}")
+        for name in ("latitude", "longitude", "height"):
+            values = getattr(self, name)
+            if values.shape != ties:
+                raise ValueError(
+                    f"{name} of a reference has shape {values.shape}, its tie points {ties}"
+                )
+        for name in ("amplitude", "rows", "columns", "latitude", "longitude", "height"):
+            values = getattr(self, name)
+            if not np.isfinite(values).all():
+                raise ValueError(f"{name} of a reference is not finite everywhere")
+        for name in ("rows", "columns"):
+            if not (np.diff(getattr(self, name)) > 0).all():
+                raise ValueError(f"{name} of the tie points of a reference do not increase")
+
+    def place(self, row: ArrayLike, column: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Latitude, longitude [rad] and height [m] of pixels, fractional, shape (...).
+
+        Raises
+        ------
+        ValueError
+            If a pixel is outside the tie points.
+        """
+        i, u = _between(row, self.rows, "row")
+        j, w = _between(column, self.columns, "column")
+
+        def interpolated(values: FloatArray) -> FloatArray:
+            near = values[i, j] * (1 - w) + values[i, j + 1] * w
+            far = values[i + 1, j] * (1 - w) + values[i + 1, j + 1] * w
+            return np.asarray(near * (1 - u) + far * u)
+
+        return (
+            interpolated(self.latitude),
+            interpolated(self.longitude),
+            interpolated(self.height),
+        )
+
+    def described(self) -> str:
+        """What it covers, for messages."""
+        south, north = np.degrees([self.latitude.min(), self.latitude.max()])
+        west, east = np.degrees([self.longitude.min(), self.longitude.max()])
+        return f"latitude {south:.3f} to {north:.3f}, longitude {west:.3f} to {east:.3f} deg"
+
+
+def _between(x: ArrayLike, knots: FloatArray, what: str) -> tuple[np.ndarray, FloatArray]:
+    x = np.asarray(x, dtype=np.float64)
+    if x.size and not (x.min() >= knots[0] and x.max() <= knots[-1]):
+        raise ValueError(
+            f"{what} {x.min():.1f} to {x.max():.1f} of a reference is outside its tie points, "
+            f"{knots[0]:.1f} to {knots[-1]:.1f}"
+        )
+    k = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 2)
+    return k, (x - knots[k]) / (knots[k + 1] - knots[k])
+
+
+def geocoded(
+    image: Image, arc: OrbitArc, terrain: Height, looks: tuple[int, int], n_ties: int = 33
+) -> Reference:
+    """Reference from a focused image whose orbit is known.
+
+    Parameters
+    ----------
+    image : Image
+    arc : OrbitArc
+        Of the radar, on the clock of the image; it must cover when the scene was in the beam.
+    terrain : callable
+        Height [m] at latitudes and longitudes [rad].
+    looks : tuple of int
+        Pixels averaged in azimuth and range.
+    n_ties : int
+        Tie points along each axis.
+    """
+    amplitude = detected(image.valid, looks)
+    ties = [np.linspace(0, n - 1, n_ties) for n in amplitude.shape]
+    row, column = (
+        part.start + full_index(t, n)
+        for t, part, n in zip(ties, (image.rows, image.columns), looks, strict=True)
+    )
+    t, R = image.seen_at(row[:, None], column[None, :], image.doppler)
+    r, v = arc.position(t), arc.velocity(t)
+    sine = image.radar.wavelength * image.doppler / (2 * np.linalg.norm(v, axis=-1))
+    p = ground_point_on_terrain(r, v, R, sine, terrain)
+    return Reference(amplitude, ties[0], ties[1], *geodetic(p))
+
+
+def earlier_pass(
+    scene: Scene,
+    footprint: Footprint,
+    looks: tuple[int, int],
+    rng: np.random.Generator,
+    snr_db: float = 10.0,
+) -> Reference:
+    """Reference as an ideal processor makes it of an earlier pass, with speckle of its own.
+
+    Parameters
+    ----------
+    scene : Scene
+    footprint : Footprint
+        Grid of the earlier pass.
+    looks : tuple of int
+        Pixels averaged in azimuth and range.
+    rng : numpy.random.Generator
+        Of speckle and noise.
+    snr_db : float
+        Ratio of mean clutter to noise [dB].
+    """
+    terrain = TerrainGrid(footprint, scene)
+    amplitude = detected(ideal_image(scene, terrain, rng, snr_db=snr_db), looks)
+    rows, columns = (multilook_index(a, n) for a, n in zip(terrain.ties, looks, strict=True))
+    return Reference(amplitude, rows, columns, terrain.latitude, terrain.longitude, terrain.height)
+
+
+def write_reference(reference: Reference, path: Path) -> None:
+    """Write a reference to a file (.npz) that `read_reference` reads."""
+    np.savez(
+        path,
+        amplitude=reference.amplitude,
+        rows=reference.rows,
+        columns=reference.columns,
+        latitude_deg=np.degrees(reference.latitude),
+        longitude_deg=np.degrees(reference.longitude),
+        height_m=reference.height,
+    )
+
+
+def read_reference(path: Path) -> Reference:
+    """Read a reference from a file (.npz) with the arrays named in `KEYS`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is no such file, or what it holds is not a reference.
+    """
+    arrays = read_arrays(path, KEYS, "a reference")
+    amplitude, rows, columns, latitude, longitude, height = (arrays[k] for k in KEYS)
+    try:
+        return Reference(
+            np.asarray(amplitude, np.float32),
+            np.asarray(rows, np.float64),
+            np.asarray(columns, np.float64),
+            np.radians(latitude),
+            np.radians(longitude),
+            np.asarray(height, np.float64),
+        )
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"'{path}': {error}") from error

@@ -1,0 +1,1 @@
+"""How bodies move: gravity, orbits, attitude, and where an orbit starts."""

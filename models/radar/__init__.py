@@ -1,0 +1,1 @@
+"""From pulses to images: echo, focusing, autofocus, and where a radar looks."""

@@ -1,0 +1,221 @@
+"""What a side-looking radar sees: a grid of time and range, and the terrain under it.
+
+Grids are of the time and the slant range at which the beam's center passes a place (broadside for
+an unsquinted beam). Terrain is looked up at every few lines and cells and interpolated between.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import ArrayLike
+
+from terrafix.models.core.arrays import FloatArray
+from terrafix.models.geometry.geodesy import ecef, geodetic, local_axes
+from terrafix.models.geometry.geolocation import ground_point
+from terrafix.models.motion.arc import OrbitArc, seen_at
+from terrafix.models.radar.chirp import Radar
+from terrafix.models.radar.scene import CELL, Scene, Single, brightness
+
+_COARSE = (16, 4)
+"""Lines and cells between the points at which terrain is looked up."""
+
+
+_CLOSE = 0.05
+"""How well the height of the terrain must agree with where it is looked up [m]."""
+_ROUNDS = 40
+"""Rounds of looking up; layover, where the height has several values, ends without agreement."""
+
+
+class Footprint:
+    """Grid of the places that an acquisition sees, by time and range of the beam's center.
+
+    Parameters
+    ----------
+    arc : OrbitArc
+        Of the radar; it must reach half an aperture beyond the grid.
+    first_time, n_lines, near_range, n_cells
+        Of the grid: lines at the repetition frequency, cells at the range spacing.
+    radar : Radar
+    centroid : float
+        Doppler frequency of the beam's center [Hz].
+    """
+
+    def __init__(
+        self,
+        arc: OrbitArc,
+        radar: Radar,
+        first_time: float,
+        n_lines: int,
+        near_range: float,
+        n_cells: int,
+        centroid: float,
+    ) -> None:
+        self.arc, self.radar, self.centroid = arc, radar, centroid
+        self.first_time, self.n_lines = first_time, n_lines
+        self.near_range, self.n_cells = near_range, n_cells
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Time [s] and range [m] of the middle of the grid."""
+        return (
+            self.first_time + (self.n_lines - 1) / 2 / self.radar.prf,
+            self.near_range + (self.n_cells - 1) / 2 * self.radar.range_spacing,
+        )
+
+    def points(self, t: ArrayLike, slant_range: ArrayLike, height: ArrayLike) -> FloatArray:
+        """Earth-fixed points (..., 3) [m] seen at times [s] and ranges [m], at heights [m]."""
+        r, v = self.arc.position(t), self.arc.velocity(t)
+        sine = self.radar.wavelength * self.centroid / (2 * np.linalg.norm(v, axis=-1))
+        return ground_point(r, v, slant_range, sine, height)
+
+    def place(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Line and cell, fractional, at which points (..., 3) [m] are seen."""
+        t, R = seen_at(self.arc, p, self.centroid, self.radar.wavelength)
+        line = (t - self.first_time) * self.radar.prf
+        return line, (R - self.near_range) / self.radar.range_spacing
+
+
+class TerrainGrid:
+    """Terrain under a footprint, at every few lines and cells.
+
+    Parameters
+    ----------
+    footprint : Footprint
+    scene : Scene
+
+    Attributes
+    ----------
+    cells : tuple of range
+        Cells of the scene's texture that hold the grid, in latitude and longitude.
+    latitude, longitude, height : ndarray, shape (n_i, n_j)
+        Of the points seen at lines ``16 i`` and cells ``4 j``, [rad] and [m].
+    power_db : ndarray, shape (n_i, n_j)
+        Brightness of the terrain there, without texture [dB].
+    """
+
+    def __init__(self, footprint: Footprint, scene: Scene) -> None:
+        self.footprint = footprint
+        n_i, n_j = (
+            -(-(n - 1) // s) + 1
+            for n, s in zip((footprint.n_lines, footprint.n_cells), _COARSE, strict=True)
+        )
+        radar = footprint.radar
+        lines, cells = _COARSE[0] * np.arange(n_i), _COARSE[1] * np.arange(n_j)
+        t: FloatArray = np.asarray(footprint.first_time + lines / radar.prf, np.float64)
+        R: FloatArray = np.asarray(footprint.near_range + cells * radar.range_spacing, np.float64)
+        surface = _Surface(footprint, t[[0, -1]], R[[0, -1]], scene)
+        self.latitude, self.longitude, self.height = surface.on(t, R)
+        self.power_db = self._power_db(scene, t)
+        self._i, self._j = self.latitude / CELL, self.longitude / CELL
+        self.cells = tuple(
+            range(int(np.floor(a.min())) - 1, int(np.ceil(a.max())) + 2) for a in (self._i, self._j)
+        )
+        self._texture = scene.texture(*self.cells)
+
+    @property
+    def ties(self) -> tuple[FloatArray, FloatArray]:
+        """Lines and cells of the footprint at which the arrays above hold."""
+        n_i, n_j = self.latitude.shape
+        return _COARSE[0] * np.arange(n_i, dtype=float), _COARSE[1] * np.arange(n_j, dtype=float)
+
+    def pixels(self, start: int, stop: int) -> tuple[Single, Single]:
+        """Mean amplitude and terrain height [m] of every pixel of some lines, (stop - start, n).
+
+        Without bright points and speckle.
+        """
+        i, j, db, height = (
+            self._interpolated(a, start, stop)
+            for a in (
+                self._i - self.cells[0].start,
+                self._j - self.cells[1].start,
+                self.power_db,
+                self.height,
+            )
+        )
+        db += cv2.remap(self._texture, j, i, cv2.INTER_LINEAR)
+        db *= np.float32(np.log(10) / 20)
+        return np.exp(db, out=db), height
+
+    def _interpolated(self, coarse: FloatArray, start: int, stop: int) -> Single:
+        """Linear interpolation of coarse values to all cells of some lines."""
+        lines, cells = np.arange(start, stop), np.arange(self.footprint.n_cells)
+        rows = _between(coarse.astype(np.float32), lines / _COARSE[0])
+        return np.ascontiguousarray(_between(rows.T, cells / _COARSE[1]).T)
+
+    def _power_db(self, scene: Scene, t: FloatArray) -> FloatArray:
+        p = ecef(self.latitude, self.longitude, self.height)
+        line = self.footprint.arc.position(t)[:, None, :] - p
+        line /= np.linalg.norm(line, axis=-1, keepdims=True)
+        east, north, up = np.moveaxis(local_axes(p), -2, 0)
+        slope_north, slope_east = scene.dem.slopes(self.latitude, self.longitude)
+        normal = up - slope_north[..., None] * north - slope_east[..., None] * east
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        power = brightness(np.sum(line * normal, axis=-1))
+        return 10 * np.log10(np.maximum(power, 1e-6))
+
+
+class _Surface:
+    """Places of a footprint as polynomials of time, range and height, then on the terrain."""
+
+    def __init__(
+        self, footprint: Footprint, times: FloatArray, ranges: FloatArray, scene: Scene
+    ) -> None:
+        self.scene = scene
+        t, R = (_nodes(a, 7) for a in (times, ranges))
+        middle = footprint.points(np.mean(times), np.mean(ranges), 0.0)
+        guess = float(scene.dem.at(*geodetic(middle)[:2]))
+        self.spans = (times, ranges, np.array([guess - 5000.0, guess + 5000.0]))
+        h = _nodes(self.spans[2], 4)
+        self.start = guess
+        p = footprint.points(t[:, None, None], R[None, :, None], h[None, None, :])
+        latitude, longitude, _ = geodetic(p)
+        center = float(longitude.flat[0])
+        longitude = center + np.angle(np.exp(1j * (longitude - center)))
+        self.coefficients = [_chebyshev3(a) for a in (latitude, longitude)]
+
+    def on(self, t: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Latitude, longitude [rad] and height [m] of the terrain seen at times and ranges."""
+        x, y = (_scaled(a, s) for a, s in zip((t, R), self.spans[:2], strict=True))
+        n = len(t) * len(R)
+        by_height = [chebyshev.chebgrid2d(x, y, c).reshape(-1, n) for c in self.coefficients]
+        h, place = np.full(n, self.start), np.empty((2, n))
+        moving, step, missed = np.arange(n), np.ones(n), np.zeros(n)
+        for k in range(_ROUNDS):
+            z = _scaled(h[moving], self.spans[2])
+            place[:, moving] = [chebyshev.chebval(z, c[:, moving], tensor=False) for c in by_height]
+            miss = self.scene.dem.at(*place[:, moving]) - h[moving]
+            # secant, its slope held to what terrain short of layover can have
+            slope = (missed - miss) / step if k else np.ones(n)
+            still = np.abs(miss) > _CLOSE
+            step = (miss / np.clip(slope, 0.3, 2.5))[still]
+            moving, missed = moving[still], miss[still]
+            if not len(moving):
+                break
+            h[moving] += step
+        shape = (len(t), len(R))
+        return place[0].reshape(shape), place[1].reshape(shape), h.reshape(shape)
+
+
+def _nodes(span: FloatArray, n: int) -> FloatArray:
+    return np.mean(span) + np.ptp(span) / 2 * chebyshev.chebpts1(n)
+
+
+def _scaled(x: FloatArray, span: FloatArray) -> FloatArray:
+    return (x - np.mean(span)) / (np.ptp(span) / 2)
+
+
+def _chebyshev3(values: FloatArray) -> FloatArray:
+    """Coefficients (n_x, n_y, n_z) of the polynomial through values at Chebyshev nodes."""
+    for axis, n in enumerate(values.shape):
+        inverse = np.linalg.inv(chebyshev.chebvander(chebyshev.chebpts1(n), n - 1))
+        values = np.moveaxis(np.tensordot(inverse, values, (1, axis)), 0, axis)
+    return values
+
+
+def _between(values: Single, place: FloatArray) -> Single:
+    """Linear interpolation along the first axis."""
+    k = np.minimum(place.astype(np.intp), len(values) - 2)
+    w = (place - k).astype(np.float32)[:, None]
+    return np.asarray(values[k] + w * (values[k + 1] - values[k]))

@@ -1,0 +1,1 @@
+"""What sensors measure, with their errors."""

@@ -1,0 +1,465 @@
+"""Campaigns: the same bytes however they are flown, killed or resumed; and what is refused."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from campaign_parts import scalar_system
+
+from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError, SystemCheckError
+from terrafix.cosim.campaign import campaign as module
+from terrafix.cosim.campaign.campaign import CampaignError, run_campaign
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.kernels import toolchain
+from terrafix.cosim.system.dispersion import Dispersion
+
+
+def contents(result):
+    dataset = result.dataset()
+    return {
+        str(k): v.values.tobytes() for k, v in dataset.variables.items() if v.dtype.kind in "fiu"
+    }
+
+
+def fly(system=None, runs=300, **options):
+    options = {"workers": 1, **options}
+    return run_campaign(system or scalar_system(wall=4.5), runs=runs, **options)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return fly()
+
+
+def test_failed_members_are_kept_counted_and_named(whole):
+    assert 5 < whole.n_excluded < 100
+    first = whole.excluded[0]
+    assert first["component"] == "filter"
+    assert set(whole.reasons) == {"start is not finite", "result is not finite"}
+    statistics = whole.statistics["judge"]
+    at_start = whole.reasons["start is not finite"]
+    assert statistics.n[0] == 300 - at_start
+    assert statistics.n[-1] == 300 - whole.n_excluded
+    summary = whole.summary()
+    assert summary["excluded"] == whole.n_excluded
+    json.dumps(summary)
+
+
+@pytest.mark.parametrize("options", [{"batch": 64}, {"batch": 192}, {"workers": 3}])
+def test_grouping_changes_no_bit(whole, options):
+    assert contents(fly(**options)) == contents(whole)
+
+
+@pytest.mark.skipif(toolchain.find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("kernel", ["c", "vm"])
+def test_kernels_change_no_bit(whole, kernel, monkeypatch):
+    """Arithmetic and square roots alone."""
+    monkeypatch.setenv("TERRAFIX_KERNEL", kernel)
+    result = fly()
+    assert result.kernel == kernel
+    assert contents(result) == contents(whole)
+
+
+def test_a_member_repeated_alone_is_the_same(whole):
+    alone = simulate(scalar_system(wall=4.5), members=[41], runs=300)
+    error = whole.dataset()["error"].values[:, 41]
+    assert alone.dataset["judge.x_error"].values[:, 0].tobytes() == error.tobytes()
+
+
+def test_interrupted_campaigns_are_resumed_to_the_same_bytes(whole, tmp_path, monkeypatch):
+    folder = tmp_path / "c"
+    real, flown = module.pools.in_this_process, []
+
+    def interrupted(task, batches, *, threads):
+        for number, blocks in enumerate(real(task, batches, threads=threads)):
+            if number == 2 and len(flown) < 2:
+                flown.append(number)
+                raise KeyboardInterrupt
+            yield blocks
+
+    monkeypatch.setattr(module.pools, "in_this_process", interrupted)
+    with pytest.raises(CampaignError, match=r"2 of 5 blocks .* are done") as caught:
+        fly(out=folder, batch=64)
+    assert f"--out {folder} --resume" in str(caught.value)
+    with pytest.raises(ConfigurationError, match="holds a campaign already"):
+        fly(out=folder, batch=64)
+    with pytest.raises(CampaignError, match="4 of 5 blocks"):
+        fly(out=folder, batch=64, resume=True)
+    (folder / "blocks" / "000001.npz").write_bytes(b"damaged")
+    result = fly(out=folder, resume=True)
+    assert contents(result) == contents(whole)
+    stored = xr.load_dataset(folder / "result.nc")
+    assert stored["mean_error"].values.tobytes() == whole.dataset()["mean_error"].values.tobytes()
+    again = fly(out=folder, resume=True)  # nothing is left to fly
+    assert contents(again) == contents(whole)
+
+
+OTHERS = [
+    ({"seed": 6}, "another seed: 5 there, 6 here"),
+    ({"runs": 301}, "another runs: 300 there, 301 here"),
+    ({"system": scalar_system(wall=4.0)}, r"components 'filter': .*'4.5 m'.* there, .*'4.0 m'"),
+]
+
+
+def test_a_folder_of_another_campaign_is_refused(whole, tmp_path, monkeypatch):
+    folder = tmp_path / "c"
+    fly(out=folder)
+    for options, text in OTHERS:
+        with pytest.raises(CheckpointError, match=text):
+            fly(**{"out": folder, "resume": True, **options})
+    from terrafix.cosim.records import results
+
+    real = results.versions()
+    monkeypatch.setattr(results, "versions", lambda: real | {"casadi": "1.0"})
+    with pytest.raises(CheckpointError, match=r"other versions: casadi .*, here 1\.0"):
+        fly(out=folder, resume=True)
+
+
+def test_folders_that_cannot_be_used_are_refused(tmp_path):
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(ConfigurationError, match="is a file; a campaign needs a folder"):
+        fly(out=file)
+    with pytest.raises(ConfigurationError, match=r"is not empty and holds no campaign"):
+        fly(out=tmp_path)
+    with pytest.raises(CheckpointError, match=r"no campaign in .* to resume"):
+        fly(out=tmp_path / "new", resume=True)
+    with pytest.raises(ConfigurationError, match="to resume a campaign, say where"):
+        fly(resume=True)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_a_full_disk_ends_a_campaign_and_keeps_what_is_done(tmp_path, monkeypatch):
+    from terrafix.cosim.campaign import store
+
+    real, count = store.write_atomically, []
+
+    def full(target, write):
+        count.append(target)
+        if len(count) > 3:
+            with Path("/dev/full").open("wb", buffering=0) as file:
+                try:
+                    file.write(b"x")
+                except OSError as error:
+                    raise ConfigurationError(
+                        f"cannot write '{target}': {error.strerror}"
+                    ) from error
+        real(target, write)
+
+    monkeypatch.setattr(store, "write_atomically", full)
+    with pytest.raises(CampaignError, match=r"No space left on device\n  2 of 5 blocks"):
+        fly(out=tmp_path / "c", batch=64)
+    monkeypatch.setattr(store, "write_atomically", real)
+    assert fly(out=tmp_path / "c", resume=True).n_excluded
+
+
+def test_a_component_that_raises_costs_its_member_alone():
+    result = fly(scalar_system(tripwire=70), runs=130)
+    (only,) = result.excluded
+    assert (only["member"], only["t_s"]) == (70, 7.0)
+    assert "the wire was touched" in only["reason"]
+    right = fly(scalar_system(tripwire=-1), runs=130).statistics["judge"]
+    mine = result.statistics["judge"]
+    assert mine.n.tolist() == [130] * 7 + [129] * 14
+    np.testing.assert_array_equal(mine.mean[:7], right.mean[:7])
+
+
+def test_nobody_left_is_an_error():
+    with pytest.raises(CampaignError, match="no member is left of 10"):
+        fly(scalar_system(wall=-50.0), runs=10)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"runs": 0}, "runs is 0"),
+        ({"workers": 0}, "workers is 0"),
+        ({"batch": 100}, "batch is 100; it is a multiple of 64"),
+        ({"histories": True}, "to keep histories, say where"),
+    ],
+)
+def test_numbers_that_make_no_campaign_are_refused(options, text):
+    with pytest.raises(ConfigurationError, match=text):
+        fly(**options)
+
+
+def test_a_system_without_evaluation_is_refused():
+    from terrafix.cosim.system.system import System
+
+    system = System("empty", duration=1)
+    inner = scalar_system()
+    system.add(type(inner.nodes["filter"])(), "filter")
+    with pytest.raises(ConfigurationError, match="has no evaluation component"):
+        fly(system, runs=2)
+
+
+# ------------------------------------------------------------------------- dispersions
+
+
+def dispersed(**options):
+    system = scalar_system()
+    options = {"spread": 0.1, **options}
+    system.disperse(Dispersion("d", ("filter.noise_sigma",), **options))
+    return system
+
+
+def values(system, runs=64, **options):
+    found = fly(system, runs=runs, **options).parameters["filter.noise_sigma"]
+    return np.asarray(found)
+
+
+def test_values_that_reached_components_are_stored():
+    drawn = values(dispersed(), runs=300)
+    assert len(drawn) == 128  # of the members shown
+    assert drawn.std() == pytest.approx(0.1, rel=0.3)
+    alone = simulate(dispersed(), members=[41], runs=300).dataset["parameter:filter.noise_sigma"]
+    assert alone.values[0] == drawn[41]
+
+
+def test_kinds_of_dispersions():
+    truncated = values(dispersed(kind="truncated", limit=1.5))
+    assert np.abs(truncated - 1).max() <= 0.15
+    factor = values(dispersed(kind="log_uniform", spread=2.0))
+    assert factor.min() > 0.5
+    assert factor.max() < 2.0
+    assert abs(np.log(factor).mean()) < 0.25
+    listed = values(dispersed(kind="list", spread=["1 m", "2 m", "5 m"]))
+    assert listed[:4].tolist() == [1, 2, 5, 1]
+
+
+@pytest.mark.parametrize("design", ["latin_hypercube", "sobol"])
+def test_designs_fill_the_range_evenly(design):
+    drawn = np.sort(values(dispersed(kind="uniform", design=design)))
+    cells = np.floor((drawn - 0.9) / 0.2 * 64).astype(int)
+    assert np.array_equal(cells, np.arange(64))  # one in each cell
+    some = simulate(dispersed(kind="uniform", design=design), members=[9], runs=64)
+    unsorted = values(dispersed(kind="uniform", design=design))
+    assert some.dataset["parameter:filter.noise_sigma"].values[0] == unsorted[9]
+
+
+def test_correlated_draws_have_their_covariance():
+    from campaign_parts import Filter
+
+    from terrafix.cosim.declare.parameters import Parameter
+
+    class Two(Filter):
+        pair = Parameter(0.0, shape=(2,), unit="m")
+
+    system = scalar_system()
+    system.add(Two(), "two")
+    covariance = [[4.0, 1.5], [1.5, 1.0]]
+    system.disperse(Dispersion("d", ("two.pair",), covariance, kind="multivariate"))
+    from terrafix.cosim.engine.simulation import Simulation
+
+    simulation = Simulation(system, members=20_000)
+    drawn = simulation.parameters["two.pair"][1]
+    simulation.master.terminate()
+    np.testing.assert_allclose(np.cov(drawn.T), covariance, rtol=0.05)
+    part = Simulation(system, members=[19_999, 7])
+    assert part.parameters["two.pair"][1].tobytes() == drawn[[19_999, 7]].tobytes()
+    part.master.terminate()
+
+
+REFUSED = [
+    (Dispersion("d", ("filter.noise_sigm",), 1), r"parameter\n  did you mean 'noise_sigma'"),
+    (Dispersion("d", ("filter.x0",), [1, 2]), "d"),
+    (Dispersion("d", ("filter.x0",), 0.0), "zero: it would not be applied"),
+    (Dispersion("d", ("filter.x0", "filter.x0"), 1), "feeds a parameter twice"),
+    (Dispersion("d", ("filter.x0",), 0.5, "log_uniform"), "give one above 1"),
+    (Dispersion("d", ("filter.x0",), -1.0, "multivariate"), "not positive definite"),
+    (Dispersion("d", ("filter.x0",), 1, "truncated", limit=-1), "a positive number of sigma"),
+    (Dispersion("d", ("filter.x0",), 3.0, "list"), "not a list of values"),
+    (Dispersion("d", ("filter.x0",), 1, design="grid"), "is of design 'grid'"),
+    (Dispersion("d", ("filter.x0",), [1.0], "list", "sobol"), "no sobol design would be applied"),
+]
+
+
+@pytest.mark.parametrize(("dispersion", "text"), REFUSED)
+def test_dispersions_that_cannot_be_applied_are_refused(dispersion, text):
+    system = scalar_system()
+    system.disperse(dispersion)
+    with pytest.raises(SystemCheckError, match=text):
+        fly(system, runs=2)
+
+
+def test_a_list_that_another_dispersion_would_change_is_refused():
+    system = dispersed(kind="list", spread=[1.0, 2.0])
+    system.disperse(Dispersion("other", ("filter.noise_sigma",), 0.1))
+    with pytest.raises(SystemCheckError, match="one of them would not be applied"):
+        fly(system, runs=2)
+
+
+# ------------------------------------------------------------------------- from the command line
+
+SYSTEM = """
+schema = "terrafix-system/1"
+name = "scalar"
+duration = "20 s"
+seed = 5
+[component.filter]
+type = "scalar_filter"
+wall = "4.5 m"
+[component.judge]
+type = "scalar_judge"
+[wiring]
+connect = [
+    "filter.truth -> judge.truth",
+    "filter.estimate -> judge.estimate",
+    "filter.variance -> judge.variance",
+    "filter.innovation -> judge.innovation",
+    "filter.innovation_variance -> judge.innovation_variance",
+]
+"""
+
+
+def plugin(folder):
+    """Make the parts known to terrafix as an installed package would; returns where to look."""
+    about = folder / "campaign_parts-1.dist-info"
+    about.mkdir(exist_ok=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: campaign_parts\nVersion: 1\n")
+    (about / "entry_points.txt").write_text(
+        "[terrafix.components]\nscalar_filter = campaign_parts:Filter\n"
+        "scalar_judge = campaign_parts:Judge\n"
+    )
+    return folder
+
+
+@pytest.fixture
+def line(tmp_path):
+    """Run terrafix in a folder that holds the system."""
+    (tmp_path / "scalar.toml").write_text(SYSTEM)
+    search = os.pathsep.join([str(Path(__file__).parent), str(plugin(tmp_path))])
+    environment = {**os.environ, "PYTHONPATH": search, "COLUMNS": "120"}
+
+    def run(*arguments, wait=True):
+        command = [sys.executable, "-m", "terrafix", *arguments]
+        process = subprocess.Popen(
+            command,
+            cwd=tmp_path,
+            env=environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        if not wait:
+            return process
+        out, err = process.communicate(timeout=120)
+        return process.returncode, out, err
+
+    return run
+
+
+def test_the_command_flies_judges_and_repeats(line, tmp_path, whole):
+    status, out, _ = line(
+        "campaign", "scalar.toml", "--runs", "300", "--out", "c", "--workers", "1"
+    )
+    assert status == 0
+    assert "verdict: " in out
+    assert f"{whole.n_excluded} of 300 members failed" in out
+    stored = xr.load_dataset(tmp_path / "c" / "result.nc")
+    assert stored["mean_error"].values.tobytes() == whole.dataset()["mean_error"].values.tobytes()
+    status, out, _ = line("campaign", "scalar.toml", "--runs", "300", "--member", "41", "--json")
+    assert status == 0
+    assert json.loads(out)["members"] == 1
+    status, out, err = line("campaign", "scalar.toml", "--out", "c", "--resume", "--json")
+    assert (status, err) == (0, "")
+    assert json.loads(out)["runs"] == 300
+
+
+def test_a_campaign_killed_three_times_is_completed_to_the_same_bytes(line, tmp_path, whole):
+    command = [
+        "campaign",
+        "scalar.toml",
+        "--runs",
+        "300",
+        "--workers",
+        "2",
+        "--out",
+        "c",
+        "--quiet",
+    ]
+    command += ["--set", "duration=4000"]  # long enough to be killed on the way
+    reference = fly(scalar_system(wall=4.5, duration=4000), seed=5)
+    rng = np.random.default_rng()
+    for _ in range(3):
+        more = ["--resume"] if (tmp_path / "c" / "campaign.json").exists() else []
+        process = line(*command, *more, wait=False)
+        time.sleep(rng.uniform(1.0, 3.5))
+        process.send_signal(signal.SIGKILL)
+        process.communicate(timeout=30)  # its workers end with it, and close the pipes
+    more = ["--resume"] if (tmp_path / "c" / "campaign.json").exists() else []
+    status, _, err = line(*command, *more)
+    assert status == 0, err
+    stored = xr.load_dataset(tmp_path / "c" / "result.nc")
+    expected = reference.dataset()
+    for name in ("mean_error", "covariance_sample", "nees", "nis", "error"):
+        assert stored[name].values.tobytes() == expected[name].values.tobytes(), name
+
+
+def test_control_c_says_what_is_kept_and_how_to_go_on(line, tmp_path):
+    command = ["campaign", "scalar.toml", "--runs", "3000", "--workers", "1", "--out", "c"]
+    process = line(*command, "--set", "duration=60000", wait=False)
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "c" / "campaign.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "Traceback" not in err
+    assert re.search(r"interrupted\n  \d+ of 47 blocks of 64 members are done, and kept", err), err
+    assert "complete them with --out c --resume" in err
+
+
+def test_a_script_needs_no_guard(tmp_path, whole):
+    """Workers do not run the script again; nor one that comes from standard input."""
+    search = os.pathsep.join([str(Path(__file__).parent), str(plugin(tmp_path))])
+    (tmp_path / "scalar.toml").write_text(SYSTEM)
+    script = (
+        "from terrafix.cosim.campaign.batch import FileSource\n"
+        "from terrafix.cosim.campaign.campaign import run_campaign\n"
+        "r = run_campaign(FileSource('scalar.toml'), runs=300, workers=2, batch=64)\n"
+        "print(r.workers, r.n_excluded)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-"],
+        input=script,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": search},
+        text=True,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.stdout.split("\n")[0] == f"2 processes {whole.n_excluded}", done.stderr
+
+
+BAD = [
+    (["campaign", "scalar.toml"], "give --runs 100"),
+    (["campaign", "scalar.toml", "--runs", "9", "--member", "9"], "no member 9 among 9 runs"),
+    (
+        ["campaign", "scalar.toml", "--runs", "9", "--dask", "tcp://127.0.0.1:1"],
+        "no Dask scheduler",
+    ),
+    (["campaign", "scalar.toml", "--runs", "9", "--dask", "local:x"], "write local:2"),
+    (["campaign", "scalar.toml", "--runs", "9", "--dask", "local:1", "--workers", "1"], "both say"),
+    (["campaign", "scalar.toml", "--runs", "9", "--set", "filter.wal=1"], "did you mean"),
+    (["report", "nothing"], "holds no campaign"),
+    (["report", "."], "holds no campaign"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "text"), BAD)
+def test_bad_input_is_one_message_and_status_2(line, arguments, text):
+    status, out, err = line(*arguments)
+    assert (status, out) == (2, ""), err
+    assert text in err
+    assert "Traceback" not in err

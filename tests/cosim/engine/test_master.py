@@ -1,0 +1,252 @@
+"""The master: failures, masks, determinism, members alone and together, and what it costs."""
+
+import time
+
+import numpy as np
+import pytest
+
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError, StepError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.engine.run import RunError, simulate
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.system import System
+
+
+def noisy(toys, **extra):
+    """Noise, dispersion, messages that reach some members, a filter that keeps a state."""
+    plan = lambda step, members: (members + step) % 3 == 0  # noqa: E731 - reads as data
+    parts = {
+        "walk": toys.Walk(),
+        "twin": toys.Walk(rate=Rate("0.3")),
+        "send": toys.Sender(plan),
+        "filter": toys.Filter(rate=Rate(2)),
+        **extra,
+    }
+    links = ["walk.x -> filter.x", "send.note -> filter.note"]
+    system = toys.wire(parts, links, ["walk.x", "twin.x", "filter.y", "send.note"], duration=12)
+    system.disperse(Dispersion("start", ("walk.start", "twin.start"), [100.0, 0.1]))
+    return system
+
+
+def columns(dataset, member):
+    """The arrays of one member as bytes, by name."""
+    one = dataset.sel(member=member)
+    return {str(k): one[k].values.tobytes() for k in one.data_vars}
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(toys):
+    first, second = (toys.payload(simulate(noisy(toys), members=5).dataset) for _ in range(2))
+    assert first == second
+    other = toys.payload(simulate(noisy(toys), members=5, seed=1).dataset)
+    assert other["walk.x"] != first["walk.x"]
+    assert other["send.note"] == first["send.note"]
+
+
+@pytest.mark.parametrize("n", [1, 7, 100])
+def test_a_member_of_an_ensemble_equals_the_same_member_alone(toys, n):
+    whole = simulate(noisy(toys), members=n).dataset
+    for member in {0, n // 2, n - 1}:
+        alone = simulate(noisy(toys), members=[member]).dataset
+        assert columns(whole, member) == columns(alone, member)
+
+
+def test_an_ensemble_may_be_split_and_shuffled(toys):
+    whole = simulate(noisy(toys), members=10).dataset
+    parts = simulate(noisy(toys), members=[9, 2, 5]).dataset
+    for member in (9, 2, 5):
+        assert columns(whole, member) == columns(parts, member)
+
+
+def test_more_components_and_recorders_change_nobodys_numbers(toys):
+    plain = simulate(noisy(toys), members=3).dataset
+    system = noisy(toys, another=toys.Walk(rate=Rate("0.7")), spy=toys.EndSpy())
+    system.add(toys.Clock(), "clock")
+    system.connect("clock.t", "spy.u")
+    system.record("more", ["another.x", "filter.y"], period="0.01")
+    more = simulate(system, members=3).dataset
+    for name in plain.data_vars:
+        assert plain[name].values.tobytes() == more[name].values.tobytes(), name
+
+
+def test_a_failed_member_is_masked_and_the_others_go_on_to_the_same_bits(toys):
+    healthy = simulate(noisy(toys, part=toys.Failing("none")), members=4)
+    result = simulate(noisy(toys, part=toys.Failing()), members=4)
+    assert result.excluded == [{"member": 1, "component": "part", "t_s": 3.0, "reason": "diverged"}]
+    assert result.status == "complete"
+    for member in (0, 2, 3):
+        assert columns(result.dataset, member) == columns(healthy.dataset, member)
+    x = result.dataset["walk.x"].sel(member=1)
+    assert np.isnan(x.sel(time_walk_x=slice(3, None))).all()
+    assert np.isfinite(x.sel(time_walk_x=slice(0, 2))).all()
+
+
+def test_a_member_fails_once_with_its_first_reason(toys):
+    parts = {"a": toys.Failing(), "b": toys.Failing()}
+    assert [
+        e["component"] for e in simulate(toys.wire(parts, [], duration=5), members=2).excluded
+    ] == ["a"]
+
+
+def test_a_run_ends_when_no_member_is_left_and_keeps_its_records(toys, tmp_path):
+    out = tmp_path / "run.nc"
+    with pytest.raises(
+        RunError, match=r"at t = 3 s \(tick 3\)\n  the last, member 1, failed in 'part': lost"
+    ) as caught:
+        simulate(
+            toys.wire({"part": toys.Failing("all")}, [], ["part.y"], duration=9), members=2, out=out
+        )
+    result = caught.value.result
+    assert len(result.excluded) == 2
+    assert result.dataset["part.y"].values[:3, 0].tolist() == [0, 1, 2]
+    assert out.is_file()
+
+
+def test_a_run_does_not_begin_without_members(toys):
+    system = toys.wire({"part": toys.Failing("all at start")}, [], ["part.y"], duration=9)
+    with pytest.raises(RunError, match=r"no member is left at t = 0 s \(tick 0\)") as caught:
+        simulate(system, members=2)
+    assert caught.value.result.component_steps == 0
+
+
+def test_a_component_that_raises_is_named_with_its_time_and_the_records_are_kept(toys, tmp_path):
+    system = toys.wire(
+        {"walk": toys.Walk(), "zeta": toys.Failing("raise", rate=Rate("0.7"))},
+        [],
+        ["walk.x"],
+        duration=9,
+    )
+    out = tmp_path / "run.nc"
+    with pytest.raises(RunError) as caught:
+        simulate(system, out=out)
+    assert str(caught.value).splitlines() == [
+        "'zeta' failed at t = 2.1 s (tick 21)",
+        "  OSError: tile ends early",
+        f"  what was recorded until then is in {out}",
+    ]
+    assert isinstance(caught.value.__cause__, StepError)
+    assert isinstance(caught.value.__cause__.__cause__, OSError)
+    assert caught.value.result.dataset["time"].values.tolist() == [0, 1, 2]
+    assert not list(tmp_path.glob("*.parts"))
+    system.nodes["walk"].start = 1.0  # nothing stays bound after a failure
+
+
+def test_errors_in_initialization_and_termination_name_the_component(toys):
+    class Stubborn(toys.Clock):
+        def terminate(self):
+            raise OSError("still open")
+
+    class Hasty(toys.Clock):
+        def _initialize_impl(self):
+            raise KeyError("x")
+
+    with pytest.raises(RunError, match=r"'a' failed at t = 0 s \(tick 0\)\n  KeyError: 'x'"):
+        simulate(toys.wire({"a": Hasty()}, [], duration=2))
+    system = toys.wire({"a": Stubborn(), "b": toys.Walk()}, [], ["b.x"], duration=2)
+    with pytest.raises(
+        RunError, match=r"'a' failed at t = 2 s \(tick 2\)\n  OSError: still open"
+    ) as caught:
+        simulate(system)
+    assert len(caught.value.result.dataset["time"]) == 3
+    system.nodes["b"].start = 1.0
+
+
+def test_an_interrupt_keeps_the_records(toys):
+    class Interrupted(toys.Clock):
+        def _step_impl(self, t, dt):
+            if t == 3:
+                raise KeyboardInterrupt
+            super()._step_impl(t, dt)
+
+    with pytest.raises(RunError, match="interrupted") as caught:
+        simulate(toys.wire({"c": Interrupted()}, [], ["c.t"], duration=9))
+    assert caught.value.result.status == "interrupted"
+    assert caught.value.result.dataset["c.t"].values[:, 0].tolist() == [0, 1, 2]
+
+
+def test_every_due_component_steps_once_per_activation(toys):
+    """A heap of next ticks: counts and times of mixed periods, offsets and lists."""
+    rates = {
+        "a": Rate("0.3"),
+        "b": Rate("1/7"),
+        "c": Rate("2", offset="0.5"),
+        "d": Rate(hz=3),
+        "e": Rate(times=["0", "0.25", "4"]),
+        "f": Rate("0.3"),
+    }
+    system = toys.wire(
+        {"m": toys.Clock()} | {k: toys.EndSpy(rate=r) for k, r in rates.items()},
+        [f"m.t -> {k}.u" for k in rates],
+    )
+    simulation = toys.fly(system, 6)
+    times = {k: [t for t, _, _ in system.nodes[k].seen] for k in rates}
+    assert times["a"] == times["f"] == [k * 3 / 10 for k in range(1, 21)]
+    assert times["b"] == [k / 7 for k in range(1, 43)]
+    assert times["c"] == [0.5, 2.5, 4.5]
+    assert times["d"] == [k / 3 for k in range(1, 19)]
+    grid = float(simulation.plan.grid)
+    assert times["e"] == pytest.approx([0.25, 4], abs=grid)
+    assert [dt for _, dt, _ in system.nodes["c"].seen] == [0.5, 2, 2]
+    assert simulation.master.component_steps == sum(map(len, times.values())) + 6
+
+
+def test_a_run_in_pieces_is_the_run_in_one(toys):
+    whole = toys.fly(noisy(toys), 12, members=3)
+    pieces = Simulation(noisy(toys), members=3)
+    for t in ("0.1", "0.3", 5, 5, "11.99", 12):
+        pieces.run_until(t)
+    for one, other in zip(whole.recorders, pieces.recorders, strict=True):
+        assert one.history()[1].keys() == other.history()[1].keys()
+        for name, values in one.history()[1].items():
+            assert values.tobytes() == other.history()[1][name].tobytes()
+    with pytest.raises(
+        ConfigurationError, match="cannot run to t = 3 s: this simulation stands at t = 12 s"
+    ):
+        pieces.run_until(3)
+
+
+def test_a_step_error_raised_by_a_component_is_named_too(toys):
+    class Own(toys.Clock):
+        def _step_impl(self, t, dt):
+            raise StepError("no convergence")
+
+    with pytest.raises(StepError, match=r"'o' failed at t = 1 s \(tick 1\)\n  no convergence"):
+        toys.fly(toys.wire({"o": Own()}, []), 1)
+
+
+class Idle(Component):
+    """Nothing but three ports of width 3."""
+
+    default_rate = Rate(hz=100)
+    a = Input((3,), default=0.0)
+    b = Input((3,), at="start")
+    y = Output((3,))
+
+    def _initialize_impl(self):
+        self.y = 0.0
+
+    def _step_impl(self, t, dt):
+        pass
+
+
+def test_a_step_costs_little():
+    """The promise is 3 microseconds per component step; the bound allows for a busy machine."""
+    n, ticks = 10, 2000
+    with System("idle") as system:
+        for k in range(n):
+            system.add(Idle(), f"c{k}")
+        for k in range(n):
+            if k:
+                system.connect(f"c{k - 1}.y", f"c{k}.a")
+            system.connect(f"c{(k + 1) % n}.y", f"c{k}.b")
+    simulation = Simulation(system)
+    simulation.initialize()
+    best = np.inf
+    for k in range(1, 6):
+        started = time.process_time()
+        simulation.master.run_until(k * ticks)
+        best = min(best, (time.process_time() - started) / (ticks * n))
+    print(f"\n{best * 1e6:.2f} microseconds per component step")
+    assert best < 10e-6

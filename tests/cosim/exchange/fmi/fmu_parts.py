@@ -1,0 +1,64 @@
+"""Small symbolic components that the tests export."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.kernels.symbolic import SymbolicComponent
+from terrafix.models.core.model import Model
+
+
+class EulerIntegrator(SymbolicComponent):
+    """x' = u + drive by the explicit Euler method, y = x + shift."""
+
+    default_rate = Rate("0.01")
+
+    shift = Parameter(1.0, doc="of the output")
+    drive = Parameter(0.0, doc="added to the input")
+
+    u = Input((), unit="1", at="start", default=0.0, doc="derivative")
+    y = Output((), unit="1", doc="state plus shift")
+
+    def build_model(self):
+        x, u, dt = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("dt")
+        shift, drive = ca.SX.sym("shift"), ca.SX.sym("drive")
+        return Model(
+            "integrator",
+            inputs={"u": u},
+            states={"x": x},
+            parameters={"shift": shift, "drive": drive},
+            next={"x": x + dt * (u + drive)},
+            outputs={"y": x + shift},
+            step=dt,
+        )
+
+
+class Spring(SymbolicComponent):
+    """A mass on a spring, forced: continuous states, an input, feedthrough."""
+
+    default_rate = Rate("0.01")
+
+    stiffness = Parameter(4.0, unit="N/m", positive=True, doc="of the spring")
+    mass = Parameter(1.5, unit="kg", positive=True, doc="of the body")
+    x0 = Parameter(0.3, unit="m", doc="position at t = 0")
+    force = Input((), unit="N", default=0.25, doc="on the body")
+    x = Output((), unit="m", doc="position")
+    acceleration = Output((), unit="m/s^2", doc="of the body")
+
+    def build_model(self):
+        x, v, force = ca.SX.sym("x"), ca.SX.sym("v"), ca.SX.sym("force")
+        k, m, x0 = ca.SX.sym("k"), ca.SX.sym("m"), ca.SX.sym("x0")
+        a = (force - k * x) / m
+        return Model(
+            "spring",
+            inputs={"force": force},
+            states={"x": x, "v": v},
+            parameters={"stiffness": k, "mass": m, "x0": x0},
+            derivatives={"x": v, "v": a},
+            initial={"x": x0},
+            outputs={"x": x, "acceleration": a},
+            step=ca.SX.sym("dt"),
+        )

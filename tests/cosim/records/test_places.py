@@ -1,0 +1,156 @@
+"""Files of a run: nobody else writes there, nothing is lost, a resumed run finds its own."""
+
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pytest
+
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.ports import Output
+from terrafix.cosim.engine.run import RunError, simulate
+from terrafix.cosim.records.results import read_result
+from terrafix.cosim.system.system import System
+
+SLOW = """
+    import sys, time
+    from terrafix.cosim.declare.component import Component
+    from terrafix.cosim.basics.clock import Rate
+    from terrafix.cosim.declare.ports import Output, State
+    from terrafix.cosim.engine.run import simulate
+    from terrafix.cosim.system.system import System
+
+    class Slow(Component):
+        default_rate = Rate("1")
+        y = Output()
+        x = State()
+
+        def _initialize_impl(self):
+            self.y = 0.0
+
+        def _step_impl(self, t, dt):
+            self.x += self.normals("w", 1)[:, 0]
+            self.y = self.x
+            time.sleep(0.01 if "slow" in sys.argv else 0.0)
+
+    system = System("slow", duration="300")
+    system.add(Slow(), "s")
+    system.record("r", ["s.y"])
+"""
+
+
+def script(folder, call):
+    file = folder / "slow.py"
+    file.write_text(textwrap.dedent(SLOW) + call + "\n")
+    return [sys.executable, str(file)]
+
+
+def wait_for(path):
+    deadline = time.monotonic() + 60
+    while not path.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_a_second_run_to_the_same_file_is_refused_while_the_first_writes(tmp_path, toys):
+    out = tmp_path / "run.nc"
+    first = subprocess.Popen([*script(tmp_path, f"simulate(system, out={str(out)!r})"), "slow"])
+    wait_for(tmp_path / "run.nc.parts" / "manifest.json")
+    with pytest.raises(ConfigurationError, match="another run is writing its records to"):
+        simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
+    assert first.wait(60) == 0
+    assert len(read_result(out)["time"]) == 301
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.nc", "slow.py"]
+
+
+def test_a_resumed_run_finds_its_result_file_again(tmp_path):
+    """Killed, then resumed without naming the result: same bytes as never stopped."""
+    out, checkpoint = tmp_path / "run.nc", tmp_path / "run.ckpt"
+    call = f"simulate(system, out={str(out)!r}, checkpoint_every='50')"
+    killed = subprocess.Popen([*script(tmp_path, call), "slow"])
+    wait_for(checkpoint)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    assert not out.exists()
+    resume = f"simulate(system, resume={str(checkpoint)!r})"
+    subprocess.run(script(tmp_path, resume), check=True)
+    whole = f"simulate(system, out={str(tmp_path / 'whole.nc')!r})"
+    subprocess.run(script(tmp_path, whole), check=True)
+    a, b = read_result(out)["s.y"].to_numpy(), read_result(tmp_path / "whole.nc")["s.y"].to_numpy()
+    assert a.tobytes() == b.tobytes()
+    assert not (tmp_path / "run.nc.parts").exists()
+
+
+def test_what_a_killed_run_left_is_kept_and_said(tmp_path, toys):
+    out = tmp_path / "run.nc"
+    call = f"simulate(system, out={str(out)!r}, checkpoint_every='50')"
+    killed = subprocess.Popen([*script(tmp_path, call), "slow"])
+    wait_for(tmp_path / "run.ckpt")
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    result = simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
+    kept = tmp_path / "run.nc.interrupted.nc"
+    assert result.notes == [f"what an interrupted run had recorded is kept in '{kept}'"]
+    assert len(read_result(kept)["time"]) >= 51
+
+
+def test_a_failed_run_does_not_replace_an_earlier_result(tmp_path, toys):
+    out = tmp_path / "run.nc"
+    simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
+    before = out.read_bytes()
+    broken = toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="5")
+
+    def stop(t, dt):
+        raise OSError("sensor unplugged")
+
+    broken.nodes["c"]._step_impl = stop
+    with pytest.raises(RunError) as caught:
+        simulate(broken, out=out)
+    assert caught.value.result.out == tmp_path / "run.failed.nc"
+    assert out.read_bytes() == before
+
+
+def test_a_result_that_cannot_be_written_keeps_its_records(tmp_path, toys, monkeypatch):
+    def full(*_, **__):
+        raise RuntimeError("NetCDF: HDF error")
+
+    monkeypatch.setattr("xarray.Dataset.to_netcdf", full)
+    with pytest.raises(RunError, match=r"the run is complete, but cannot write(.|\n)*make room"):
+        simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=tmp_path / "run.nc")
+    assert list((tmp_path / "run.nc.parts").glob("*.npz"))
+    assert not list(tmp_path.glob(".*partial"))
+
+
+class Mute(Component):
+    default_rate = Rate("1")
+    said = Output()
+    unsaid = Output()
+
+    def _step_impl(self, t, dt):
+        self.said = np.nan  # a NaN of one's own is not silence
+
+
+def test_an_output_that_was_never_published_is_named():
+    system = System("mute", duration="2")
+    system.add(Mute(), "mute")
+    assert simulate(system).notes == ["output 'mute.unsaid' was never published"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"seed": "x"}, "seed is 'x'; it is a whole number from 0 on"),
+        ({"seed": -1}, "seed is -1"),
+        ({"members": 10**20}, "there are at most 4294967295"),
+        ({"out": "run.txt"}, "is no .nc file"),
+    ],
+)
+def test_impossible_runs_are_refused(options, message, toys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigurationError, match=message):
+        simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), **options)

@@ -1,0 +1,120 @@
+"""Dispersions: one draw may feed several parameters, and is a function of seed, member and name."""
+
+import numpy as np
+import pytest
+
+from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.system import System
+
+
+def pair(toys, *dispersions, parts=("ekf", "ukf")):
+    system = toys.wire({k: toys.Walk(start=[10, 20]) for k in parts}, [], duration=1)
+    for dispersion in dispersions:
+        system.disperse(dispersion)
+    return system
+
+
+BOTH = Dispersion("initial_position", ("ekf.start", "ukf.start"), [100.0, 1.0])
+
+
+def starts(system, **options):
+    simulation = Simulation(system, **options)
+    found = {k: c.start.copy() for k, c in system.nodes.items()}
+    simulation.master.terminate()
+    return found
+
+
+def test_two_filters_start_from_the_same_draw(toys):
+    found = starts(pair(toys, BOTH), members=50)
+    assert found["ekf"].tobytes() == found["ukf"].tobytes()
+    assert len(np.unique(found["ekf"][:, 0])) == 50
+
+
+def test_a_draw_depends_on_seed_member_and_name_alone(toys):
+    whole = starts(pair(toys, BOTH), members=50)["ekf"]
+    for members in ([7], [49, 3]):
+        some = starts(pair(toys, BOTH), members=members)["ekf"]
+        assert some.tobytes() == whole[members].tobytes()
+    alone = Dispersion("initial_position", ("ekf.start",), [100.0, 1.0])
+    assert starts(pair(toys, alone, parts=("ekf",)), members=50)["ekf"].tobytes() == whole.tobytes()
+    other = Dispersion("other", ("ukf.start",), [100.0, 1.0])
+    both = starts(pair(toys, alone, other), members=50)
+    assert both["ekf"].tobytes() == whole.tobytes() != both["ukf"].tobytes()
+    assert starts(pair(toys, BOTH), members=50, seed=1)["ekf"].tobytes() != whole.tobytes()
+
+
+@pytest.mark.parametrize("kind", ["normal", "uniform"])
+def test_the_spread_is_the_standard_deviation_or_the_half_width(toys, kind):
+    n = 20_000
+    draws = starts(pair(toys, Dispersion("d", ("ekf.start",), [100.0, 1.0], kind)), members=n)[
+        "ekf"
+    ]
+    draws = (draws - [10, 20]) / [100, 1]
+    sigma = 1 if kind == "normal" else 1 / np.sqrt(3)
+    np.testing.assert_allclose(draws.mean(axis=0), 0, atol=4 * sigma / np.sqrt(n))
+    np.testing.assert_allclose(draws.std(axis=0), sigma, rtol=4 / np.sqrt(2 * n))
+    assert kind == "normal" or np.abs(draws).max() < 1
+    assert abs(np.corrcoef(draws.T)[0, 1]) < 4 / np.sqrt(n)
+
+
+def test_units_and_dispersed_values_are_read_back_in_the_result(toys):
+    system = pair(toys, Dispersion("d", ("ekf.start",), "0.1 km"))
+    result = simulate(system, members=3)
+    stored = result.dataset["parameter:ekf.start"]
+    assert stored.attrs["units"] == "m"
+    np.testing.assert_array_equal(stored.values, starts(system, members=3)["ekf"])
+    assert np.abs(stored.values - [10, 20]).max() > 10
+
+
+def test_dispersions_do_not_pile_up_over_runs(toys):
+    system = pair(toys, BOTH)
+    first, second = starts(system, members=3), starts(system, members=3)
+    assert first["ekf"].tobytes() == second["ekf"].tobytes()
+    np.testing.assert_array_equal(system.nodes["ekf"].setting("start"), [10, 20])
+
+
+def test_dispersions_of_nested_systems_take_its_path(toys):
+    inner = pair(toys, BOTH)
+    outer = System("outer", duration=1)
+    outer.add(inner, "nav")
+    simulation = Simulation(outer, members=2)
+    assert list(simulation.master.draws) == ["nav.initial_position"]
+    assert simulation.parameters.keys() == {"nav.ekf.start", "nav.ukf.start"}
+
+
+@pytest.mark.parametrize(
+    ("dispersion", "text"),
+    [
+        (Dispersion("d", ("efk.start",), 1), r"no component 'efk'\n  did you mean 'ekf'\?"),
+        (
+            Dispersion("d", ("ekf.x",), 1),
+            "no numeric parameter\n  numeric parameters: position, start",
+        ),
+        (Dispersion("d", (), 1), "feeds no parameter"),
+        (Dispersion("d", ("ekf.start",), -1), "must be at least 0"),
+        (Dispersion("d", ("ekf.start",), "1 s"), "the units differ: s is not m"),
+        (Dispersion("d", ("ekf.start",), 1, "gaussian"), "is of kind 'gaussian'"),
+    ],
+)
+def test_dispersions_that_cannot_be_are_found_before_the_run(toys, dispersion, text):
+    with pytest.raises(SystemCheckError, match=text):
+        Simulation(pair(toys, dispersion))
+
+
+def test_a_draw_out_of_range_is_refused_and_nothing_stays_bound(toys):
+    class Positive(toys.Walk):
+        start = type(toys.Walk.start)(1.0, shape=(2,), unit="m", positive=True)
+
+    system = toys.wire({"w": Positive()}, [], duration=1)
+    system.disperse(Dispersion("d", ("w.start",), 100.0))
+    with pytest.raises(ConfigurationError, match=r"'w\.start' after dispersion 'd'"):
+        simulate(system, members=10)
+    system.nodes["w"].start = 2.0
+
+
+def test_dispersions_have_one_name_each(toys):
+    with pytest.raises(ConfigurationError, match="has a dispersion 'initial_position' already"):
+        pair(toys, BOTH, BOTH)

@@ -1,0 +1,324 @@
+"""Systems: building, nesting, exposing, and every mistake reported at once."""
+
+import numpy as np
+import pytest
+
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import (
+    ConfigurationError,
+    RateError,
+    SystemCheckError,
+    WiringError,
+)
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.system.check import check
+from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.system import System
+
+
+def navigator(toys, name="inner"):
+    """A filter that reads a signal from outside and exposes what it makes of it."""
+    system = toys.wire(
+        {"one": toys.EndSpy(), "two": toys.EndSpy()}, ["one.echo -> two.u"], name=name
+    )
+    system.expose("u", "one.u")
+    system.expose("echo", system.nodes["two"]["echo"])
+    return system
+
+
+def test_nested_systems_are_flattened_for_ordering(toys):
+    """Feedthrough goes into the nested system, through it, and out again, within one tick."""
+    spy = toys.EndSpy()
+    inner = navigator(toys)
+    inner.record("inside", ["one.echo"])
+    with System("outer", duration=2) as system:
+        nav = system.add(inner, "nav")
+        clock = system.add(toys.Clock(), "z")
+        last = system.add(spy, "a")
+        system.connect(clock["t"], nav["u"])
+        system.connect(nav["echo"], last["u"])
+        system.record("through", [nav["echo"]])
+    plan = check(system)
+    assert plan.order == ["z", "nav.one", "nav.two", "a"]
+    result = simulate(system)
+    assert spy.values() == [(1, 1), (2, 2)]
+    assert result.dataset["nav.two.echo"].values[:, 0].tolist() == [0, 1, 2]
+    assert result.dataset["nav.one.echo"].dims[0] == "time"
+
+
+def test_systems_nest_twice_and_may_be_wired_by_path(toys):
+    middle = System("middle")
+    middle.add(navigator(toys), "deep")
+    middle.expose("input", "deep.u")
+    with System("outer") as system:
+        system.add(middle, "m")
+        system.add(toys.Clock(), "c")
+        system.connect("c.t", "m.input")
+        spy = system.add(toys.EndSpy(), "s")
+        system.connect("m.deep.two.echo", "s.u")
+    toys.fly(system, 1)
+    assert spy.values() == [(1, 1)]
+    assert system.find("m.deep.one").name == "one"
+    with pytest.raises(
+        ConfigurationError, match=r"no component 'm\.deep\.on'\n  did you mean 'm\.deep\.one'"
+    ):
+        system.find("m.deep.on")
+
+
+def test_a_nested_system_flies_as_the_flat_one_does(toys):
+    """The same links give the same values; noise follows the path, so parts without noise agree."""
+    flat = toys.wire(
+        {"c": toys.Clock(), "one": toys.EndSpy(), "two": toys.EndSpy()},
+        ["c.t -> one.u", "one.echo -> two.u"],
+    )
+    toys.fly(flat, 3)
+    outer = System("outer")
+    outer.add(navigator(toys), "nav")
+    outer.add(toys.Clock(), "c")
+    outer.connect("c.t", "nav.u")
+    toys.fly(outer, 3)
+    assert outer.find("nav.two").values() == flat.find("two").values()
+
+
+def test_a_system_is_not_in_two_places(toys):
+    inner, outer, other = navigator(toys), System("outer"), System("other")
+    outer.add(inner, "nav")
+    for host, name in ((outer, "nav2"), (other, "nav")):
+        with pytest.raises(ConfigurationError, match="'nav' is part of a system already"):
+            host.add(inner, name)
+    with pytest.raises(ConfigurationError, match="'nav' cannot contain itself"):
+        inner.add(outer, "loop")
+    with pytest.raises(ConfigurationError, match="this EndSpy is 'one' already; make another one"):
+        outer.add(inner.nodes["one"], "again")
+    outer.remove("nav")
+    other.add(inner, "nav")
+
+
+def test_names_that_cannot_be_are_refused(toys):
+    system = System("s")
+    for name in ("", "1a", "a.b", "a b"):
+        with pytest.raises(ConfigurationError, match="cannot name a component"):
+            system.add(toys.Clock(), name)
+    with pytest.raises(ConfigurationError, match="'record' cannot name a component: it is a table"):
+        system.add(toys.Clock(), "record")
+    system.add(toys.Clock(), "a")
+    with pytest.raises(ConfigurationError, match="has a component 'a' already"):
+        system.add(toys.Clock(), "a")
+    with pytest.raises(ConfigurationError, match="cannot name a system"):
+        System("my system")
+    with pytest.raises(RateError, match="duration is 0; it must be positive"):
+        System("s", duration=0)
+
+
+def test_two_drivers_are_refused_also_through_nesting(toys):
+    system = toys.wire({"a": toys.Clock(), "b": toys.Clock(), "s": toys.EndSpy()}, ["a.t -> s.u"])
+    with pytest.raises(
+        WiringError, match=r"input 's\.u' has two drivers\n  'a\.t' is connected to it already"
+    ):
+        system.connect("b.t", "s.u")
+    inner = navigator(toys)
+    inner.add(toys.Clock(), "own")
+    inner.connect("own.t", "one.u")
+    outer = System("outer")
+    outer.add(inner, "nav")
+    outer.add(toys.Clock(), "c")
+    outer.connect("c.t", "nav.u")
+    with pytest.raises(
+        SystemCheckError, match=r"'nav\.one\.u' has two drivers\n  'nav\.own\.t' and 'c\.t'"
+    ):
+        check(outer)
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "text"),
+    [
+        ("c.t", "spy.v", r"'spy' has no port 'v'"),
+        ("clock.t", "spy.u", r"no component 'clock' in 'clock\.t'"),
+        ("c", "spy.u", r"'c' is no port; write 'component\.port'"),
+        ("c.t.x", "spy.u", r"'c\.t\.x' is no port"),
+        ("c.t", "nav.up", r"exposes no port 'up'\n  did you mean 'u'\?"),
+        ("c.t", "nav.one.echo", "is an output; a connection ends at an input"),
+    ],
+)
+def test_ports_that_do_not_exist_are_refused(toys, source, target, text):
+    system = toys.wire({"c": toys.Clock(), "spy": toys.EndSpy(), "nav": navigator(toys)}, [])
+    with pytest.raises(WiringError, match=text):
+        system.connect(source, target)
+    with pytest.raises(WiringError, match="belongs to no component of system 'test'; add it first"):
+        system.connect(toys.Clock()["t"], "spy.u")
+
+
+def test_a_component_is_replaced_by_another_on_the_same_ports(toys):
+    class Playback(toys.Clock):
+        def _publish(self, t):
+            self.t = 100 + t
+
+    spy = toys.EndSpy()
+    system = toys.wire({"truth": toys.Clock(), "spy": spy}, ["truth.t -> spy.u"], ["truth.t"])
+    old = system.nodes["truth"]
+    system.remove("truth")
+    with pytest.raises(SystemCheckError, match=r"'spy\.u' is not connected"):
+        check(system)
+    system.add(Playback(), "truth")
+    system.connect("truth.t", "spy.u")
+    toys.fly(system, 1)
+    assert spy.values() == [(1, 101)]
+    assert old.name == ""
+
+
+def test_replacing_keeps_the_connections(toys):
+    class Playback(toys.Clock):
+        def _publish(self, t):
+            self.t = 100 + t
+
+    spy = toys.EndSpy()
+    system = toys.wire({"truth": toys.Clock(), "spy": spy}, ["truth.t -> spy.u"])
+    system.replace("truth", Playback())
+    toys.fly(system, 1)
+    assert spy.values() == [(1, 101)]
+
+
+def test_a_component_that_does_not_fit_replaces_nothing(toys):
+    system = toys.wire({"truth": toys.Clock(), "spy": toys.EndSpy()}, ["truth.t -> spy.u"])
+    before = list(system.connections)
+    misfit = toys.EndSpy()
+    with pytest.raises(WiringError, match="'truth' has no port 't'"):
+        system.replace("truth", misfit)
+    assert system.connections == before
+    assert (system.nodes["truth"].name, misfit.name) == ("truth", "")
+    check(system)
+
+
+class Needy(Component):
+    needed = Parameter(unit="m")
+    u = Input((3,), unit="m", frame="e")
+    y = Output((3,), unit="m", frame="e")
+
+    def validate(self):
+        raise ConfigurationError("never reached: a parameter is missing")
+
+
+def test_all_mistakes_are_reported_together(toys):
+    class Wrong(toys.EndSpy):
+        u = Input((2,), unit="furlongs/parsek")
+
+        def validate(self):
+            raise ConfigurationError("'wrong' has a bad combination")
+
+    system = toys.wire(
+        {"needy": Needy(), "a": toys.EndSpy(), "b": toys.EndSpy(), "wrong": Wrong()},
+        ["a.echo -> b.u", "b.echo -> a.u"],
+    )
+    system.record("h", ["needy.z"])
+    system.record("both", ["a.echo", "needy.y"])
+    system.disperse(Dispersion("d", ("needy.nothing",), 1))
+    with pytest.raises(SystemCheckError) as caught:
+        check(system)
+    text = str(caught.value)
+    assert text.startswith("system 'test' has 10 problems\n")
+    for part in (
+        "'needy' needs a value for 'needed': it takes number [m]",
+        "'needy' has no rate",
+        "input 'needy.u' is not connected and has no default\n  no output of the system has",
+        "'wrong' has a bad combination",
+        "'furlongs/parsek' is not a unit",
+        "input 'wrong.u' is not connected",
+        "'needy' has no port 'z'",
+        "feeds 'needy.nothing', which is no numeric parameter",
+        "algebraic loop",
+    ):
+        assert part in text
+    assert len({type(p) for p in caught.value.problems}) == 3
+
+
+def test_an_unconnected_input_names_what_would_fit(toys):
+    system = toys.wire({"c": toys.Clock(), "s": toys.EndSpy(), "w": toys.Walk()}, [])
+    text = r"outputs of the same shape, unit and frame: 'c\.t'$"
+    with pytest.raises(SystemCheckError, match=text):
+        check(system)
+
+
+def test_an_empty_system_is_a_mistake():
+    with pytest.raises(SystemCheckError, match="the system has no components"):
+        check(System("nothing"))
+
+
+def test_records_that_cannot_be_are_refused(toys):
+    parts = lambda: {"c": toys.Clock(), "f": toys.EndSpy(rate=Rate(2)), "s": toys.Source()}  # noqa: E731
+    for ports, text in (
+        (["f.u"], r"names the input 'f\.u'\s+record the output that feeds it: 'c\.t'"),
+        (["s.image"], "complex64; records hold real numbers"),
+        (["c.t", "f.echo"], r"different rates \(every 1 s, every 2 s\)\n  give it a period"),
+    ):
+        system = toys.wire(parts(), ["c.t -> f.u"])
+        system.record("r", ports)
+        with pytest.raises(SystemCheckError, match=text):
+            check(system)
+    with pytest.raises(ConfigurationError, match="record 'r' names no ports"):
+        System("x").record("r", [])
+    with pytest.raises(ConfigurationError, match="has a record 'r' already"):
+        system.record("r", ["c.t"])
+
+
+def test_records_of_nested_systems_do_not_share_a_name(toys):
+    inner = navigator(toys)
+    inner.record("h", ["one.echo"])
+    outer = System("outer")
+    outer.add(inner, "nav")
+    outer.add(toys.Clock(), "c")
+    outer.connect("c.t", "nav.u")
+    outer.record("nav_h", ["c.t"])
+    with pytest.raises(SystemCheckError, match="two records are called 'nav_h'"):
+        check(outer)
+
+
+def test_notes_tell_what_is_allowed_but_worth_knowing(toys):
+    class Milli(toys.EndSpy):
+        u = Input(unit="ms")
+
+    system = toys.wire(
+        {"c": toys.Clock(), "s": toys.StartSpy(), "m": Milli()}, ["c.t -> s.u", "c.t -> m.u"]
+    )
+    system.record("fine", ["c.t"], period="0.25")
+    notes = " | ".join(check(system).notes)
+    assert "'s.u' is read at the start of the step: it sees 'c.t' of one step earlier" in notes
+    assert "'c.t -> m.u' is converted from s to ms (x 1000)" in notes
+    assert "between its steps the last value is held" in notes
+
+
+def test_two_simulations_of_one_system_do_not_mix(toys):
+    """The later one takes the components; the earlier one refuses to go on with them."""
+    system = toys.wire({"c": toys.Clock()}, [])
+    first = Simulation(system)
+    first.run_until(1)
+    second = Simulation(system, members=3)
+    with pytest.raises(
+        ConfigurationError, match="another simulation of the same system has taken it"
+    ):
+        first.run_until(2)
+    first.master.terminate()  # lets go of nothing that is not its own
+    second.run_until(2)
+    np.testing.assert_array_equal(system.nodes["c"].t, [2, 1002, 2002])
+
+
+def test_members_are_different_whole_numbers(toys):
+    system = toys.wire({"c": toys.Clock()}, [])
+    for members in (0, -1, True, [], [1, 1], [-1], [0.5], [2**32]):
+        with pytest.raises(ConfigurationError, match="members"):
+            Simulation(system, members=members)
+
+
+def test_a_component_without_a_step_is_refused_before_the_run():
+    class Idle(Component):
+        default_rate = Rate("1")
+
+    system = System("test")
+    system.add(Idle(), "idle")
+    with pytest.raises(
+        SystemCheckError, match=r"'idle' cannot step: Idle must provide _step_impl\(t, dt\)"
+    ):
+        check(system)
