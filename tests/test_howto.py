@@ -45,7 +45,9 @@ def test_a_file_format_is_found_by_its_suffix(tmp_path):
         """.replace(";", ", ")
     table = re.sub(r"(\w+=\[.*?\] [\w/]+)", r'"\1"', textwrap.dedent(table))
     (tmp_path / "table.csv").write_text(table.replace(', "', ',"'))
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from terrafix.cli import main; main()"
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from terrafix.cli import main; main()"
+    )
     command = [sys.executable, "-c", code, "check"]
     done = subprocess.run(
         [*command, str(tmp_path / "table.csv")], capture_output=True, text=True, check=False
@@ -72,4 +74,8 @@ def test_the_map_names_every_folder():
     tops = {"models", "cosim", "components", "src/terrafix"}
     assert named == there - inner - tops
     for folder in inner:
-        assert folder.rpartition("exchange/")[2] in page.replace("`fmi/write`, `fmi/run`", "")  or folder in page or folder.split("exchange/")[1] in page
+        assert (
+            folder.rpartition("exchange/")[2] in page.replace("`fmi/write`, `fmi/run`", "")
+            or folder in page
+            or folder.split("exchange/")[1] in page
+        )
