@@ -235,7 +235,7 @@ def test_parameters_cannot_be_set_while_a_simulation_runs(build):
 
 def test_every_type_that_comes_with_terrafix_is_registered_and_tested():
     folder = Path(__file__).parents[2] / "components"
-    public = {n for file in folder.glob("*.py") for n in _components(file)}
+    public = {n for file in folder.rglob("*.py") for n in _components(file)}
     assert {component_entries()[n].value.split(":")[1] for n in TYPES if n not in FOREIGN} == public
 
 
