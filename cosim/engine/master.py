@@ -142,17 +142,17 @@ class Master:
             runs=int(members.max()) + 1 if runs is None else runs,
         )
         self.wiring = connect_ports(plan, len(members), self.active)
-        self._groups: list[_Group] = []
-        self._group_of: dict[str, int] = {}
+        self.groups: list[_Group] = []
+        self.group_of: dict[str, int] = {}
         for path in plan.order:
             rate = plan.flat.components[path].rate
             assert rate is not None
-            self._group_of[path] = self._groups.index(self._group(rate))
+            self.group_of[path] = self.groups.index(self._group(rate))
         self._entries = {
             path: _Entry(
                 path,
                 plan.flat.components[path],
-                self._groups[self._group_of[path]],
+                self.groups[self.group_of[path]],
                 self.wiring,
             )
             for path in plan.order
@@ -161,18 +161,18 @@ class Master:
         self._heap: list[tuple[int, int]] = []
 
     def _group(self, rate: Rate) -> _Group:
-        for group in self._groups:
+        for group in self.groups:
             if group.rate == rate and group.sample is None:
                 return group
         group = _Group(rate, self.plan)
-        self._groups.append(group)
+        self.groups.append(group)
         return group
 
     def observe(self, rate: Rate, sample: Callable[[float], None]) -> None:
         """Call `sample(t)` at a rate, after everything due has stepped; it influences nothing."""
         group = _Group(rate, self.plan)
         group.sample = sample
-        self._groups.append(group)
+        self.groups.append(group)
 
     def seconds(self, tick: int) -> float:
         """Time of a tick [s], by one division."""
@@ -217,24 +217,24 @@ class Master:
             for transfer in self.wiring.latch.get(path, ()):
                 transfer(0)
         self._check_members()
-        for group in self._groups:
+        for group in self.groups:
             if observe and group.sample is not None and group.rate.starts_at_zero:
                 group.sample(0.0)
         self._arm()
 
     def _arm(self) -> None:
         self._heap = [
-            (g.next_tick, i) for i, g in enumerate(self._groups) if g.next_tick is not None
+            (g.next_tick, i) for i, g in enumerate(self.groups) if g.next_tick is not None
         ]
         heapq.heapify(self._heap)
 
     def _program(self, due: tuple[int, ...]) -> _Program:
         groups = set(due)
-        entries = tuple(e for p, e in self._entries.items() if self._group_of[p] in groups)
+        entries = tuple(e for p, e in self._entries.items() if self.group_of[p] in groups)
         latches = tuple(t for e in entries for t in self.wiring.latch.get(e.path, ()))
-        samples = tuple(s for i in due if (s := self._groups[i].sample) is not None)
+        samples = tuple(s for i in due if (s := self.groups[i].sample) is not None)
         stretch = None
-        if len(due) == 1 and not samples and self._groups[due[0]].spacing:
+        if len(due) == 1 and not samples and self.groups[due[0]].spacing:
             stretch = self._stretch(entries, latches)
         program = _Program(entries, latches, samples, stretch)
         self._programs[due] = program
@@ -276,7 +276,7 @@ class Master:
         assert group.next_tick is not None
         first, spacing = group.next_tick, group.spacing
         # recorders look on once the others have stepped: a stretch may end at their tick
-        others = (tick - (self._groups[i].sample is None) for tick, i in self._heap if i != number)
+        others = (tick - (self.groups[i].sample is None) for tick, i in self._heap if i != number)
         last = min(end, *others) if len(self._heap) > 1 else end
         n_ticks = (last - first) // spacing + 1
         if n_ticks < 2 or first - group.tick != spacing or last * self._numerator > 2**53:
@@ -336,7 +336,7 @@ class Master:
                     f"'{path}' has been terminated, or another simulation of the same system has "
                     "taken it over\n  run one after the other, or build the system twice"
                 )
-        heap, groups, programs = self._heap, self._groups, self._programs
+        heap, groups, programs = self._heap, self.groups, self._programs
         numerator, denominator = self._numerator, self._denominator
         entry: _Entry | None = None
         n_excluded = len(self.excluded)
@@ -387,7 +387,7 @@ class Master:
         while self._heap and self._heap[0][0] == tick:
             number = heapq.heappop(self._heap)[1]
             due.append(number)
-            group = self._groups[number]
+            group = self.groups[number]
             group.advance()
             if group.next_tick is not None:
                 heapq.heappush(self._heap, (group.next_tick, number))
@@ -456,6 +456,6 @@ class Master:
             self._entries[path].component.set_state(state)
         for name, state in saved["links"].items():
             self.wiring.keepers[name].set_state(state)
-        for group in self._groups:
+        for group in self.groups:
             group.move_to(self.tick)
         self._arm()

@@ -10,7 +10,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from terrafix.cosim.lincov.deviations import LinearCovariance
+from terrafix.cosim.lincov.prediction import LinearCovariance
 from terrafix.cosim.show.numbers import number, shown_unit
 
 MOST_SOURCES = 6

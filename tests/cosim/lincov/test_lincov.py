@@ -9,7 +9,8 @@ from campaign_parts import scalar_system
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.campaign.campaign import run_campaign
 from terrafix.cosim.files.reading import read_system
-from terrafix.cosim.lincov.deviations import LinearCovariance, linear_covariance
+from terrafix.cosim.lincov.deviations import linear_covariance
+from terrafix.cosim.lincov.prediction import LinearCovariance
 from terrafix.cosim.system.dispersion import Dispersion
 
 OPEN_LOOP = Path(__file__).parents[3] / "examples" / "spacecraft_sar_open_loop.toml"
