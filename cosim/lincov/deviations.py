@@ -34,7 +34,7 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Exact, seconds
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.engine.simulation import Simulation
-from terrafix.cosim.lincov.jacobians import Call, Key, error_jacobian
+from terrafix.cosim.lincov.jacobians import Call, Key, Listener, Notes, error_jacobian
 from terrafix.cosim.lincov.layout import Layout, Wires
 from terrafix.cosim.lincov.observability import directions
 from terrafix.cosim.lincov.prediction import LinearCovariance
@@ -102,11 +102,11 @@ class _Analysis:
         self._wires = Wires(simulation.plan, simulation.system.name)
         self._error_jacobian = error_jacobian(self._wires.error_model)
         self._layout = Layout(simulation.plan, self._wires)
-        self._order = {path: i for i, path in enumerate(simulation.plan.order)}
+        self._notes = Notes()
         self._noted: list[_Noted] = []
         self._errors: list[dict[str, FloatArray]] = []
         for linear in self._layout.linear.values():
-            linear.component.call = linear.listener
+            linear.component.call = Listener(linear, self._notes)
 
     # ------------------------------------------------------------------ the nominal run
 
@@ -160,16 +160,10 @@ class _Analysis:
 
     def _note(self, tick: int, repeat: int) -> None:
         """Fly to a tick, noting the Jacobians of all steps, which are made there alone."""
-        listeners = [linear.listener for linear in self._layout.linear.values()]
-        for listener in listeners:
-            listener.calls.clear()
-            listener.noting = True
+        self._notes.listening, self._notes.calls = True, []
         self._simulation.master.run_until(tick)
-        for listener in listeners:
-            listener.noting = False
-        calls = [call for listener in listeners for call in listener.calls]
-        calls.sort(key=lambda call: self._order[call.path])
-        self._noted.append(_Noted(calls, repeat))
+        self._notes.listening = False
+        self._noted.append(_Noted(self._notes.calls, repeat))
         if tick in self._epochs:
             self._move()
             self._evaluate()
@@ -183,7 +177,7 @@ class _Analysis:
         layout = self._layout
         self._S = layout.start()
         self._C: dict[str, FloatArray] = {}
-        for path in self._order:
+        for path in self._simulation.plan.order:
             linear = layout.linear.get(path)
             jacobian = None if linear is None else linear.at_start()
             if linear is None or jacobian is None:
@@ -281,20 +275,10 @@ class _Analysis:
     def _apply(self, steps: _Steps, repeat: int) -> None:
         """Make n steps, each of them `repeat` times; all but the last among what is read alone."""
         rows, columns, f, g = steps
-        n, m = len(f), len(columns)
-        row_of = {place: i for i, place in enumerate(rows)}
-        changed = np.array([place in row_of for place in columns], dtype=np.bool_)
-        mine = [row_of[place] for place in columns[changed]]
-        inner = np.tile(np.eye(m), (n, 1, 1))
-        inner[:, changed] = f[:, mine]
-        noise = np.concatenate([*g.values(), np.zeros((n, len(rows), 0))], axis=2)
-        driven = np.zeros((n, m, noise.shape[2]))
-        driven[:, changed] = noise[:, mine]
+        inner, driven = _among_read(steps)
         reach = reached(inner, driven)
-        q = np.zeros((n, len(g), len(reach), len(reach)))
-        for i, each in enumerate(g.values()):
-            part = np.zeros((n, m, each.shape[2]))
-            part[:, changed] = each[:, mine]
+        q = np.zeros((len(f), len(g), len(reach), len(reach)))
+        for i, part in enumerate(driven):
             q[:, i] = part[:, reach] @ part[:, reach].swapaxes(1, 2)
         before = repeated(inner[:-1], q[:-1], reach, repeat)
         last = repeated(inner[-1:], q[-1:], reach, repeat - 1)
@@ -363,3 +347,18 @@ class _Analysis:
             filtered,
             {name: c for name, c in sources.items() if np.any(c)},
         )
+
+
+def _among_read(steps: _Steps) -> tuple[FloatArray, list[FloatArray]]:
+    """Transitions of what is read, and what each source of noise does to that."""
+    row_of = {place: i for i, place in enumerate(steps.rows)}
+    changed = np.array([place in row_of for place in steps.columns], dtype=np.bool_)
+    mine = [row_of[place] for place in steps.columns[changed]]
+    inner = np.tile(np.eye(len(changed)), (len(steps.f), 1, 1))
+    inner[:, changed] = steps.f[:, mine]
+    driven = []
+    for each in steps.g.values():
+        part = np.zeros((len(each), len(changed), each.shape[2]))
+        part[:, changed] = each[:, mine]
+        driven.append(part)
+    return inner, driven

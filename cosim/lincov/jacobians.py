@@ -87,7 +87,6 @@ class Linear:
             start: _jacobian(self, component.kernel.function, start=start)
             for start in (True, False)
         }
-        self.listener = Listener(self)
 
     def _named(self) -> list[str]:
         return [*self.states, *self.outputs, *self.noise, *self.parameters, *self.inputs]
@@ -146,28 +145,35 @@ class Evaluation:
         return self._result.T.copy()
 
 
+class Notes:
+    """Calls in the order in which components stepped, while `listening`."""
+
+    def __init__(self) -> None:
+        self.listening = False
+        self.calls: list[Call] = []
+
+
 class Listener(BoundKernel):
-    """The kernel of a component, noting Jacobians when it is told to.
+    """The kernel of a component, noting Jacobians where somebody listens.
 
     A stretch of ticks that is handed to compiled code goes past it.
     """
 
-    def __init__(self, linear: Linear) -> None:
+    def __init__(self, linear: Linear, notes: Notes) -> None:
         self._linear = linear
+        self._notes = notes
         self._kernel = linear.component.call
         self._jacobian = linear.evaluation(start=False)
         self.stage = getattr(self._kernel, "stage", None)
-        self.calls: list[Call] = []
-        self.noting = False
 
     def __call__(self, step: int) -> int:
         """Step."""
-        if not self.noting:
+        if not self._notes.listening:
             return self._kernel(step)
         jacobian = np.zeros((0, 0)) if self._jacobian is None else self._jacobian()
         failed = self._kernel(step)
-        published = (bool(flag[0] > 0.5) for flag in self._linear.component.messages.values())
-        self.calls.append(Call(self._linear.path, jacobian, tuple(published)))
+        published = tuple(bool(f[0] > 0.5) for f in self._linear.component.messages.values())
+        self._notes.calls.append(Call(self._linear.path, jacobian, published))
         return failed
 
 
@@ -191,7 +197,7 @@ def _jacobian(linear: Linear, step: Any, *, start: bool) -> tuple[Any, list[str]
     jacobian = ca.densify(ca.jacobian(ca.vertcat(*rows), ca.vertcat(*by)))
     free = {e.element_hash() for e in ca.symvar(jacobian)}
     needed = [n for n in names if any(e.element_hash() in free for e in symbols[n].elements())]
-    made = ca.Function("jacobian", [symbols[n] for n in needed], [jacobian], {"cse": True})
+    made = ca.Function("jacobian", [symbols[n] for n in needed], [jacobian])
     return made, needed
 
 

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.show.numbers import number, shown_unit
 
 SCHEMA = "terrafix-lincov/1"
 UNOBSERVED = 0.5
 """Part of a variance that fixes leave, above which its direction counts as not observed."""
+MOST_SOURCES = 6
+MOST_AXES = 12
+WORTH_SHOWING = 0.0005
+"""Part of a variance: what rounds to 0.1 % or more."""
 
 
 class Direction(NamedTuple):
@@ -71,12 +77,71 @@ class LinearCovariance:
     def budget(self) -> dict[str, FloatArray]:
         """Sigma at the end due to each source alone, (n_axes,), the largest contribution first."""
         total = np.diagonal(self.total[-1])
+        whole = np.where(total > 0, total, 1.0)
         found = {name: np.sqrt(np.diagonal(c[-1])) for name, c in self.sources.items()}
-        return dict(sorted(found.items(), key=lambda item: -float((item[1] ** 2 / total).max())))
+        return dict(sorted(found.items(), key=lambda item: -float((item[1] ** 2 / whole).max())))
+
+    def shares(self) -> dict[str, FloatArray]:
+        """Part of the variance at the end due to each source, (n_axes,), in that order."""
+        total = np.diagonal(self.total[-1])
+        whole = np.where(total > 0, total, 1.0)
+        return {name: sigma**2 / whole for name, sigma in self.budget().items()}
+
+    def largest(self) -> dict[str, FloatArray]:
+        """Of `shares`, the few that a person looks at: none below `WORTH_SHOWING`."""
+        seen = {n: share for n, share in self.shares().items() if share.max() >= WORTH_SHOWING}
+        return dict(list(seen.items())[:MOST_SOURCES])
 
     def unobserved(self) -> list[Direction]:
         """Directions of which the fixes leave more than `UNOBSERVED`."""
         return [d for d in self.directions if d.remaining > UNOBSERVED]
+
+    def end(self) -> list[tuple[str, str, float, float, float]]:
+        """By axis: label, unit for a person, sigma of a sample and of the filter in it, ratio."""
+        found = []
+        for i, label in enumerate(self.labels):
+            unit, factor = shown_unit(self.units[i])
+            sample, filtered = float(self.sigma[-1, i]), float(self.sigma_filter[-1, i])
+            ratio = sample / filtered if filtered > 0 else np.nan
+            found.append((label, unit, sample * factor, filtered * factor, ratio))
+        return found
+
+    def _rows(self) -> tuple[str, list[tuple[str, ...]], list[tuple[str, ...]]]:
+        """A title, the sigma by axis, the largest sources: each with its head, a screen at most."""
+        title = f"linear covariance of '{self.path}' at t = {self.times[-1]:g} s"
+        axes: list[tuple[str, ...]] = [("one sigma", "unit", "of a sample", "of the filter")]
+        axes += [(name, unit, number(s), number(f)) for name, unit, s, f, _ in self.end()]
+        more = len(axes) - 1 - MOST_AXES
+        axes[1 + MOST_AXES :] = [(f"and {more} more", "", "", "")] if more > 0 else []
+        sources: list[tuple[str, ...]] = [("largest sources", "part of the variance")]
+        for name, share in self.largest().items():
+            i = int(share.argmax())
+            sources.append((name, f"{100 * share[i]:.1f} % of {self.labels[i]}"))
+        return title, axes, sources
+
+    def __repr__(self) -> str:
+        title, *tables = self._rows()
+        lines = [title]
+        for rows in tables:
+            widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+            for row in rows:
+                cells = [row[0].ljust(widths[0])]
+                right = len(row) > 2
+                cells += [
+                    c.rjust(w) if right else c for c, w in zip(row[1:], widths[1:], strict=True)
+                ]
+                lines.append("  " + "  ".join(cells).rstrip())
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        title, *tables = self._rows()
+        parts = [f"<p>{escape(title)}</p>"]
+        for head, *rows in tables:
+            cells = "".join(f"<th>{escape(c)}</th>" for c in head)
+            body = ("".join(f"<td>{escape(c)}</td>" for c in row) for row in rows)
+            lines = "".join(f"<tr>{row}</tr>" for row in body)
+            parts.append(f"<table><tr>{cells}</tr>{lines}</table>")
+        return "".join(parts)
 
     def dataset(self) -> Any:
         """As an `xarray.Dataset`."""

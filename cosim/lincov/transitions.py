@@ -6,6 +6,7 @@ A tick takes what it reads of the deviations, :math:`u`, to :math:`f u + g w` wi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,18 +29,20 @@ class Chain(NamedTuple):
     added: FloatArray
 
 
-def reached(f: FloatArray, g: FloatArray) -> NDArray[np.intp]:
+def reached(f: FloatArray, driven: Sequence[FloatArray]) -> NDArray[np.intp]:
     """Elements that noise gets to, at once or by way of others.
 
     Parameters
     ----------
     f : ndarray, shape (n, m, m)
         Transitions.
-    g : ndarray, shape (n, m, n_noise)
-        What noise does at each.
+    driven : sequence of ndarray, shape (n, m, n_noise)
+        What each source of noise does at each.
     """
     links = np.any(f != 0.0, axis=0)
-    found = np.any(g != 0.0, axis=(0, 2))
+    found = np.zeros(f.shape[1], dtype=np.bool_)
+    for each in driven:
+        found |= np.any(each != 0.0, axis=(0, 2))
     while True:
         more = found | links[:, found].any(axis=1)
         if (more == found).all():
