@@ -28,7 +28,9 @@ from terrafix.cosim.basics.noise import NormalBlocks, NormalStream
 from terrafix.cosim.declare.parameters import Parameter, Setting
 from terrafix.cosim.declare.ports import Capabilities, Declaration, Port, State
 
-ATTRIBUTES = frozenset({"name", "rate", "ports", "step_index", "kernel"})  # of every component
+ATTRIBUTES = frozenset(
+    {"name", "rate", "ports", "step_index", "kernel", "call", "messages"}
+)  # of every component
 KEYS = frozenset({"type", "period", "offset", "times", "doc"})  # of its table in a file
 
 

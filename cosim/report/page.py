@@ -9,8 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from html import escape
 from typing import Any
 
-from terrafix.cosim.lincov.deviations import LinearCovariance
 from terrafix.cosim.lincov.display import describe
+from terrafix.cosim.lincov.prediction import LinearCovariance
 from terrafix.cosim.report.figures import figures, render
 from terrafix.cosim.report.reading import Campaign
 from terrafix.cosim.show.numbers import number, shown_unit
