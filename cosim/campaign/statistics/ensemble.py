@@ -23,7 +23,7 @@ from terrafix.cosim.campaign.statistics.statistic import (
 )
 from terrafix.cosim.campaign.statistics.whiteness import Whiteness
 
-STANDARD: tuple[Statistic, ...] = (*(Moments(), Quantiles(), Nees(), Nis(), Whiteness(), Shown()),)
+STANDARD = (Moments(), Quantiles(), Nees(), Nis(), Whiteness(), Shown())
 STATISTICS: list[Statistic] = [*STANDARD]
 """What campaigns keep, in the order of their results; append your own."""
 
@@ -111,9 +111,10 @@ class Statistics:
     def __repr__(self) -> str:
         """One line."""
         end = int(self.n[-1]) if self.sums else 0
+        quantities = ", ".join(name for name, _, _ in self.layout.quantities)
         return (
             f"<Statistics of '{self.layout.path}': {end} members at the end, "
-            f"{len(self.layout.times)} epochs, axes {', '.join(self.layout.labels)}>"
+            f"{len(self.layout.times)} epochs of {quantities}>"
         )
 
 
