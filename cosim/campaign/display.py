@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import shlex
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -13,13 +13,11 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from terrafix.cosim.campaign.outcome import Outcome
 from terrafix.cosim.campaign.statistics.ensemble import facts_of
 from terrafix.cosim.campaign.statistics.moments import EndRow, end_rows
 from terrafix.cosim.campaign.verdict import Verdict
 from terrafix.cosim.show.numbers import number, shown_unit
-
-if TYPE_CHECKING:
-    from terrafix.cosim.campaign.results import CampaignResult
 
 _STYLES = {"consistent": "bold green", "undecided": "bold yellow"}
 NAMED = 5
@@ -27,7 +25,7 @@ WIDTH, ROWS, EVALUATIONS = 100, 15, 3
 """Of what is shown at a prompt: characters, rows of tables, evaluation components."""
 
 
-def campaign_tables(result: CampaignResult, system: str) -> list[Any]:
+def campaign_tables(result: Outcome, system: str) -> list[Any]:
     """What a person wants to know of a campaign, as rich renderables in the order of reading."""
     shown = overview(result)
     repeat = f"terrafix campaign {shlex.quote(system)} --runs {result.runs} --seed {result.seed}"
@@ -37,7 +35,7 @@ def campaign_tables(result: CampaignResult, system: str) -> list[Any]:
     return shown
 
 
-def overview(result: CampaignResult, *, brief: bool = False) -> list[Any]:
+def overview(result: Outcome, *, brief: bool = False) -> list[Any]:
     """The same without what to do next; on one screen, if `brief`."""
     header = Text(f"{result.system}: {result.runs} runs", style="bold")
     facts = [
@@ -55,7 +53,7 @@ def overview(result: CampaignResult, *, brief: bool = False) -> list[Any]:
             shown.append(Text(f"\n{path}", style="bold"))
         summary = statistics.summary()
         shown.append(_table(list(end_rows(summary)), ROWS // n_shown if brief else None))
-        shown += [Text(line) for line in _aligned(facts_of(summary, statistics.kinds))]
+        shown += [Text(line) for line in _aligned(facts_of(summary, statistics.present))]
         if path in result.verdicts:
             shown.append(_verdict(result.verdicts[path]))
     rest = [f"{path} ({verdict.text})" for path, verdict in result.verdicts.items()][n_shown:]
@@ -64,19 +62,21 @@ def overview(result: CampaignResult, *, brief: bool = False) -> list[Any]:
     return shown + [Text(line) for line in _failures(result, NAMED if brief else None)]
 
 
-def as_text(result: CampaignResult) -> str:
+def as_text(result: Outcome) -> str:
     """A screen of plain text."""
     return _console(result).export_text().rstrip()
 
 
-def as_html(result: CampaignResult) -> str:
+def as_html(result: Outcome) -> str:
     """The same for a notebook."""
     frame = '<pre style="line-height: 1.3">{code}</pre>'
     return _console(result).export_html(inline_styles=True, code_format=frame)
 
 
-def _console(result: CampaignResult) -> Console:
-    console = Console(file=io.StringIO(), record=True, width=WIDTH)
+def _console(result: Outcome) -> Console:
+    console = Console(
+        file=io.StringIO(), record=True, width=WIDTH, force_jupyter=False, legacy_windows=False
+    )
     console.print(*overview(result, brief=True), sep="\n")
     return console
 
@@ -124,7 +124,7 @@ def _verdict(verdict: Verdict) -> Text:
     return text.append("".join(f"\n  {reason}" for reason in verdict.reasons))
 
 
-def _failures(result: CampaignResult, most: int | None) -> Iterator[str]:
+def _failures(result: Outcome, most: int | None) -> Iterator[str]:
     if not result.n_excluded:
         return
     yield f"{result.n_excluded} of {result.runs} members failed and are left out from then on:"

@@ -4,82 +4,28 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from fractions import Fraction
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from terrafix.cosim.basics.clock import text_seconds
-from terrafix.cosim.campaign.batch import BlockResult
-from terrafix.cosim.campaign.statistics.ensemble import Statistics
-from terrafix.cosim.campaign.statistics.statistic import BLOCK, SHOWN
-from terrafix.cosim.campaign.verdict import Verdict
+from terrafix.cosim.campaign.outcome import Outcome
+from terrafix.cosim.campaign.statistics.statistic import SHOWN
 
 if TYPE_CHECKING:
     import xarray
 
-
 SCHEMA = "terrafix-campaign-result/1"
-MOST_NAMED = 1000
-"""Failed members listed in a result; all are counted, and all are in the blocks."""
 COMMON = ("member", "quantile")
 """Dimensions that all evaluation components share."""
 
 
-@dataclass(repr=False)
-class CampaignResult:
-    """What a campaign gives back.
-
-    Attributes
-    ----------
-    system : str
-    seed, runs : int
-    statistics : dict of str to Statistics
-        By evaluation component.
-    verdicts : dict of str to Verdict
-    excluded : list of dict
-        Failed members, up to `MOST_NAMED`: ``member``, ``component``, ``t_s``, ``reason``.
-    n_excluded : int
-    parameters : dict of str to ndarray
-        Dispersed parameters as they reached the components, of the first `SHOWN` members.
-    kernel : str
-    wall_s, setup_s : float
-        Time of flying and merging; time to check and build before it.
-    workers : str
-        What flew it.
-    configuration : dict
-        Everything that was set.
-    out : Path or None
-    """
-
-    system: str
-    doc: str
-    seed: int
-    runs: int
-    duration: Fraction
-    configuration: dict[str, Any]
-    statistics: dict[str, Statistics]
-    workers: str
-    setup_s: float
-    wall_s: float = 0.0
-    kernel: str = ""
-    verdicts: dict[str, Verdict] = field(default_factory=dict)
-    excluded: list[dict[str, Any]] = field(default_factory=list)
-    n_excluded: int = 0
-    reasons: dict[str, int] = field(default_factory=dict)
-    parameters: dict[str, Any] = field(default_factory=dict)
-    parameter_units: dict[str, str] = field(default_factory=dict)
-    graph: str = ""
-    source: dict[str, Any] = field(default_factory=dict)
-    out: Path | None = None
+class CampaignResult(Outcome):
+    """What a campaign gives back; `Outcome` says what each attribute is."""
 
     def summary(self) -> dict[str, Any]:
         """Plain types, for JSON."""
         return summary_of(self)
 
-    def dataset(self) -> Any:
+    def dataset(self) -> xarray.Dataset:
         """Statistics as an `xarray.Dataset`."""
         return build_result(self)
 
@@ -94,24 +40,8 @@ class CampaignResult:
 
         return as_html(self)
 
-    def add(self, block: BlockResult) -> None:
-        """Take up the statistics and failures of one block; blocks come in order."""
-        for path, sums in block.sums.items():
-            self.statistics[path].add(sums)
-        self.n_excluded += len(block.excluded)
-        for each in block.excluded:
-            self.reasons[each["reason"]] = self.reasons.get(each["reason"], 0) + 1
-            if len(self.excluded) < MOST_NAMED:
-                self.excluded.append(each)
-        if block.number * BLOCK < SHOWN:
-            for name, values in block.parameters.items():
-                before = [self.parameters[name]] if name in self.parameters else []
-                self.parameters[name] = np.concatenate([*before, values])
-        kinds = {k for k in [*self.kernel.split("+"), *block.kernel.split("+")] if k}
-        self.kernel = "+".join(sorted(kinds))
 
-
-def summary_of(result: CampaignResult) -> dict[str, Any]:
+def summary_of(result: Outcome) -> dict[str, Any]:
     """Plain types for JSON; by evaluation component where there are several."""
     from terrafix.cosim.records.results import cpu_name, versions
 
@@ -137,7 +67,7 @@ def summary_of(result: CampaignResult) -> dict[str, Any]:
     }
 
 
-def build_result(result: CampaignResult) -> xarray.Dataset:
+def build_result(result: Outcome) -> xarray.Dataset:
     """Statistics as labeled arrays; names begin with the path where there are several."""
     import xarray
 
@@ -155,14 +85,14 @@ def build_result(result: CampaignResult) -> xarray.Dataset:
             into = coordinates if dims == (name,) else variables
             into[name if name in COMMON else f"{prefix}{name}"] = (own, values)
     for name, values in result.parameters.items():
-        dims = [f"dim_{extent}" for extent in values.shape[1:]]
-        dims = [d if dims.index(d) == i else f"{d}b" for i, d in enumerate(dims)]
+        own = [f"dim_{extent}" for extent in values.shape[1:]]
+        own = [d if own.index(d) == i else f"{d}b" for i, d in enumerate(own)]
         about = {"units": result.parameter_units.get(name, "")}
-        variables[f"parameter:{name}"] = (["member", *dims], values[:SHOWN], about)
+        variables[f"parameter:{name}"] = (["member", *own], values[:SHOWN], about)
     return xarray.Dataset(variables, coordinates, _attributes(result))
 
 
-def _attributes(result: CampaignResult) -> dict[str, Any]:
+def _attributes(result: Outcome) -> dict[str, Any]:
     from terrafix.cosim.records.results import cpu_name, versions
 
     verdicts: Mapping[str, Any] = {p: v.summary() for p, v in result.verdicts.items()}

@@ -88,7 +88,7 @@ def judge(statistics: Statistics, *, level: float = LEVEL) -> Verdict:
         if not (biased and kind.spoiled_by_bias)
     ]
     known = [f.word for f in found]
-    words = [w for w in ("biased", "overconfident", "conservative") if w in known]
+    words: list[str] = [w for w in ("biased", "overconfident", "conservative") if w in known]
     if "overconfident" in words and "conservative" in words:
         words.remove("conservative")  # said in the findings; what endangers a mission comes first
     if not words:

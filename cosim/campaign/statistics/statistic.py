@@ -154,7 +154,10 @@ class Statistic:
         return {}
 
     def facts(self, summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Terms and sentences about them, from the summary of all statistics."""
+        """Terms and sentences about them, from the summary of all statistics.
+
+        Nothing where the summary has none: it may be that of a campaign flown without.
+        """
         del summary
         yield from ()
 

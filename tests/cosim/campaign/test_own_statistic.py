@@ -40,7 +40,8 @@ class Largest(Statistic):
 
     def facts(self, summary):
         """One sentence."""
-        yield "largest", f"error of any member {summary['largest_error'][0]:.3f}"
+        for most in summary.get("largest_error", []):
+            yield "largest", f"error of any member {most:.3f}"
 
 
 class Limit(Largest):
