@@ -41,7 +41,7 @@ class CampaignResult(Outcome):
         return as_html(self)
 
 
-def summary_of(result: Outcome) -> dict[str, Any]:
+def summary_of(result: CampaignResult) -> dict[str, Any]:
     """Plain types for JSON; by evaluation component where there are several."""
     from terrafix.cosim.records.results import cpu_name, versions
 
@@ -67,7 +67,7 @@ def summary_of(result: Outcome) -> dict[str, Any]:
     }
 
 
-def build_result(result: Outcome) -> xarray.Dataset:
+def build_result(result: CampaignResult) -> xarray.Dataset:
     """Statistics as labeled arrays; names begin with the path where there are several."""
     import xarray
 
@@ -92,7 +92,7 @@ def build_result(result: Outcome) -> xarray.Dataset:
     return xarray.Dataset(variables, coordinates, _attributes(result))
 
 
-def _attributes(result: Outcome) -> dict[str, Any]:
+def _attributes(result: CampaignResult) -> dict[str, Any]:
     from terrafix.cosim.records.results import cpu_name, versions
 
     verdicts: Mapping[str, Any] = {p: v.summary() for p, v in result.verdicts.items()}
