@@ -7,15 +7,18 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from campaign_parts import scalar_system
+from campaign_parts import Judge, scalar_system
 
 from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError, SystemCheckError
 from terrafix.cosim.campaign import campaign as module
+from terrafix.cosim.campaign.batch import FileSource
 from terrafix.cosim.campaign.campaign import CampaignError, run_campaign
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.kernels import toolchain
@@ -169,7 +172,7 @@ def test_a_component_that_raises_costs_its_member_alone():
     right = fly(scalar_system(tripwire=-1), runs=130).statistics["judge"]
     mine = result.statistics["judge"]
     assert mine.n.tolist() == [130] * 7 + [129] * 14
-    np.testing.assert_array_equal(mine.mean[:7], right.mean[:7])
+    np.testing.assert_array_equal(mine["mean_error"][:7], right["mean_error"][:7])
 
 
 def test_nobody_left_is_an_error():
@@ -199,6 +202,97 @@ def test_a_system_without_evaluation_is_refused():
     system.add(type(inner.nodes["filter"])(), "filter")
     with pytest.raises(ConfigurationError, match="has no evaluation component"):
         fly(system, runs=2)
+
+
+# ------------------------------------------------------------------------- what is given, and shown
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """A system file whose components this process knows."""
+    monkeypatch.syspath_prepend(str(plugin(tmp_path)))
+    file = tmp_path / "scalar.toml"
+    file.write_text(SYSTEM)
+    return file
+
+
+def test_a_path_is_enough(file, whole, monkeypatch):
+    assert contents(fly(file)) == contents(whole)
+    monkeypatch.chdir(file.parent)
+    assert contents(fly("scalar.toml")) == contents(whole)
+    set_so = fly(file, runs=64, settings=[("filter.wall", "4 m")])
+    assert contents(set_so) == contents(fly(scalar_system(wall=4.0), runs=64))
+    given = FileSource(str(file), (("filter.wall", "3 m"), ("filter.tuning", "2")))
+    last = fly(given, runs=64, settings=[("filter.wall", "4 m")])
+    assert last.source["settings"] == [
+        [*pair] for pair in (*given.settings, ("filter.wall", "4 m"))
+    ]
+    assert contents(last) == contents(fly(scalar_system(wall=4.0, tuning=2.0), runs=64))
+
+
+def test_what_cannot_be_flown_is_refused(file):
+    with pytest.raises(ConfigurationError, match="'scalar' is built already, so settings cannot"):
+        fly(settings=[("filter.wall", "4 m")])
+    with pytest.raises(ConfigurationError, match="a system or the path of its file, not dict"):
+        fly({"filter": 1})
+    with pytest.raises(ConfigurationError, match=r"absent\.toml"):
+        fly(file.parent / "absent.toml")
+    with pytest.raises(SystemCheckError, match="did you mean 'wall'"):
+        fly(file, settings=[("filter.wal", "4 m")])
+
+
+def two_judges():
+    """The scalar system, judged twice."""
+    system = scalar_system(wall=4.5, bias=1.0)
+    system.add(Judge(), "second")
+    for port in system.nodes["judge"].inputs():
+        system.connect(f"filter.{port}", f"second.{port}")
+    return system
+
+
+SHOWN_AT_A_PROMPT = [
+    (
+        lambda: fly(),
+        ["scalar: 300 runs", "sample sigma", "NEES", "verdict: ", "of 300 members failed"],
+    ),
+    (lambda: fly(two_judges()), ["judge\n", "second\n", "biased: mean error of x"]),
+    (lambda: fly(runs=2), ["verdict: undecided", "fly 3 or more"]),
+]
+
+
+@pytest.mark.parametrize(("made", "parts"), SHOWN_AT_A_PROMPT)
+def test_a_result_shows_itself_on_one_screen(made, parts):
+    result = made()
+    text = repr(result)
+    for part in parts:
+        assert part in text
+    assert len(text.splitlines()) <= 40
+    assert max(map(len, text.splitlines())) <= 100
+    html = re.sub("<[^>]*>", "", result._repr_html_())
+    assert unescape(html).strip() == text
+    statistics, verdict = result.statistics["judge"], result.verdicts["judge"]
+    assert repr(statistics).startswith("<Statistics of 'judge': ")
+    assert len(repr(statistics)) < 120
+    assert verdict.text in repr(verdict)
+    assert len(repr(verdict).splitlines()) <= 6
+
+
+def test_the_repr_of_a_campaign_of_many_things_is_still_a_screen(whole):
+    many = replace(
+        whole,
+        statistics={f"judge{k}": whole.statistics["judge"] for k in range(40)},
+        verdicts={f"judge{k}": whole.verdicts["judge"] for k in range(40)},
+        reasons={f"reason {k}": 1 for k in range(300)},
+    )
+    text = repr(many)
+    assert "and judge3 (" in text
+    assert "and 295 other reasons" in text
+    assert len(text.splitlines()) <= 60
+
+
+def test_a_column_that_is_not_there_is_named(whole):
+    with pytest.raises(ConfigurationError, match="no 'mean_eror'\n  did you mean 'mean_error'"):
+        whole.statistics["judge"]["mean_eror"]
 
 
 # ------------------------------------------------------------------------- dispersions

@@ -53,7 +53,7 @@ def test_dispersions_are_sources():
     found = linear_covariance(system)
     sampled = run_campaign(system, runs=4000, workers=1).statistics["judge"]
     assert found.sigma[-1, 0] == pytest.approx(
-        np.sqrt(sampled.covariance_sample[-1, 0, 0]), rel=4 / np.sqrt(8000)
+        np.sqrt(sampled["covariance_sample"][-1, 0, 0]), rel=4 / np.sqrt(8000)
     )
     assert found.budget()["dispersion bias"][0] == pytest.approx(0.3, rel=1e-3)
 
@@ -128,7 +128,7 @@ def test_the_open_loop_as_sampled(open_loop):
 
     source = FileSource(str(OPEN_LOOP), (("case", "TC-2"),))
     s = run_campaign(source, runs=256, duration="123", workers=1).statistics["evaluation"]
-    sample = np.sqrt(np.diagonal(s.covariance_sample[-1]))
-    predicted = np.sqrt(np.diagonal(s.covariance_predicted[-1]))
+    sample = np.sqrt(np.diagonal(s["covariance_sample"][-1]))
+    predicted = np.sqrt(np.diagonal(s["covariance_predicted"][-1]))
     np.testing.assert_allclose(sample, open_loop.sigma[-1], rtol=4 / np.sqrt(512))
     np.testing.assert_allclose(predicted, open_loop.sigma_filter[-1], rtol=5e-3)
