@@ -25,7 +25,7 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Input, Output
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.records.results import cpu_name, versions
 from terrafix.cosim.system.system import System
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.cosim.engine.run import Result, simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 
 SYSTEM = Path(__file__).parent / "spacecraft_sar_open_loop.toml"
 

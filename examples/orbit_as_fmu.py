@@ -21,7 +21,7 @@ import numpy as np
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import earth_fixed_from_inertial

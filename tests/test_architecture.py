@@ -44,6 +44,7 @@ HEAVY = {
     "terrafix.cosim.system.system": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
     "terrafix.cosim.engine.run": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
     "terrafix.cosim.files.reading": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
+    "terrafix.cosim.files.readers": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
     "terrafix.cli": "numpy casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
 }
 

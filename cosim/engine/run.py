@@ -84,7 +84,7 @@ def simulate(
     if not isinstance(system, System):
         raise ConfigurationError(
             f"simulate takes a System, not {type(system).__name__}\n"
-            "  read a file with terrafix.cosim.files.reading.read_system"
+            "  read a file with terrafix.cosim.files.readers.read_system"
         )
     length = _duration(system, duration)
     out = None if out is None else writable(Path(out))

@@ -45,7 +45,7 @@ def predict(campaign: Campaign) -> None:
 
 def _system(campaign: Campaign) -> Any:
     """The system that was flown, if its file still says the same."""
-    from terrafix.cosim.files.reading import read_system
+    from terrafix.cosim.files.readers import read_system
     from terrafix.cosim.system.check import check
     from terrafix.cosim.system.identity import configuration
 

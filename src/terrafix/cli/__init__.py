@@ -171,16 +171,7 @@ def _target(option: str, text: str | None, suffixes: tuple[str, ...]) -> Path | 
 
 
 def _read(path: str, settings: Settings, *, outside: bool = False) -> System:
-    if Path(path).suffix.lower() == ".ssp":
-        from terrafix.cosim.exchange.ssp.reading import read_ssp
-
-        if settings:
-            raise ConfigurationError(
-                f"--set does not reach into '{path}'\n"
-                "  terrafix ssp import writes it as a system file, where everything can be set"
-            )
-        return read_ssp(path)
-    from terrafix.cosim.files.reading import read_system
+    from terrafix.cosim.files.readers import read_system
 
     return read_system(path, settings, outside=outside)
 

@@ -8,7 +8,7 @@ from campaign_parts import scalar_system
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.campaign.campaign import run_campaign
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.lincov.deviations import LinearCovariance, linear_covariance
 from terrafix.cosim.system.dispersion import Dispersion
 
