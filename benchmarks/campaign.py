@@ -324,7 +324,8 @@ def main() -> None:
     if arguments.measure:
         print(json.dumps(MEASURES[arguments.measure](arguments.scale)))
         return
-    from terrafix.cosim.records.results import cpu_name, versions
+    from terrafix.cosim.basics.machine import cpu_name
+    from terrafix.cosim.records.results import versions
 
     print(f"{cpu_name()}, {os.cpu_count()} processors; {versions()}")
     scale = 0.05 if arguments.quick else 1.0

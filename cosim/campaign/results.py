@@ -184,7 +184,8 @@ def _evaluation(statistics: Statistics) -> dict[str, Any]:
 
 def summary_of(result: CampaignResult) -> dict[str, Any]:
     """Plain types for JSON; by evaluation component where there are several."""
-    from terrafix.cosim.records.results import cpu_name, versions
+    from terrafix.cosim.basics.machine import cpu_name
+    from terrafix.cosim.records.results import versions
 
     each = {
         path: _evaluation(s) | {"verdict": result.verdicts[path].summary()}
@@ -268,7 +269,8 @@ def build_result(result: CampaignResult) -> xarray.Dataset:
 
 
 def _attributes(result: CampaignResult) -> dict[str, Any]:
-    from terrafix.cosim.records.results import cpu_name, versions
+    from terrafix.cosim.basics.machine import cpu_name
+    from terrafix.cosim.records.results import versions
 
     verdicts: Mapping[str, Any] = {p: v.summary() for p, v in result.verdicts.items()}
     plain = {

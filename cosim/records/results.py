@@ -50,17 +50,6 @@ def versions() -> dict[str, str]:
     return found
 
 
-def cpu_name() -> str:
-    """Type of the processor, as far as the system tells."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
 class _Labels:
     """Dimensions of variables, shared where size and labels agree."""
 
