@@ -15,6 +15,7 @@ from typing import Any
 
 from terrafix.cosim.basics.clock import Exact, seconds, text_seconds
 from terrafix.cosim.basics.errors import ConfigurationError, RateError, StepError, TerrafixError
+from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.basics.machine import processors
 from terrafix.cosim.campaign import pools
 from terrafix.cosim.campaign.batch import (
@@ -29,7 +30,6 @@ from terrafix.cosim.campaign.statistics import BLOCK, Statistics
 from terrafix.cosim.campaign.store import RESULT, SUMMARY, Store
 from terrafix.cosim.campaign.verdict import judge
 from terrafix.cosim.engine.simulation import MAX_MEMBER, Simulation
-from terrafix.cosim.records.recorder import write_atomically
 from terrafix.cosim.system.identity import configuration
 from terrafix.cosim.system.system import System
 

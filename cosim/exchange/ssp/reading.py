@@ -20,6 +20,7 @@ from xml.etree import ElementTree as ET
 
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError, nearest
+from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.exchange.fmi.run.archive import checked_xml, unpack
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.ssp.linear import Linear
@@ -126,7 +127,8 @@ def import_ssp(path: str | Path, target: Path) -> Path:
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
-    target.write_text(text.replace(f"{folder.resolve()}", folder.name), encoding="utf-8")
+    content = text.replace(f"{folder.resolve()}", folder.name).encode()
+    write_atomically(target, lambda f: f.write(content))
     return folder
 
 

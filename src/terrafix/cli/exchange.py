@@ -8,6 +8,7 @@ import click
 
 from terrafix.cli.options import Settings, json_option, read, set_option, system_argument
 from terrafix.cli.output import FAILED, print_json, show
+from terrafix.cosim.basics.files import writable_target
 
 MOST_SHOWN = 6
 """Findings of one check."""
@@ -29,9 +30,9 @@ def export_fmu_command(
     what: str, out: str, fmi: str, platforms: str, settings: Settings, as_json: bool
 ) -> None:
     """Export a component, or a whole symbolic system, as an FMU."""
-    from terrafix.cosim.exchange.fmi.write.export import checked_target, export_fmu
+    from terrafix.cosim.exchange.fmi.write.export import export_fmu
 
-    checked_target(out)
+    writable_target(out, (".fmu",))
     path, component = _named(what)
     loaded = read(path, settings, outside=True)
     made = export_fmu(loaded, out, component=component, fmi=int(fmi), platforms=platforms)
@@ -110,10 +111,9 @@ def ssp_export(
     as_json: bool,
 ) -> None:
     """Write a system as a package of FMUs (FMI 2)."""
-    from terrafix.cosim.exchange.fmi.write.export import checked_target
     from terrafix.cosim.exchange.ssp.export import export_ssp
 
-    checked_target(out, ".ssp")
+    writable_target(out, (".ssp",))
     made = export_ssp(
         read(system, settings, outside=True), out, platforms=platforms, leave_out=leave_out
     )
@@ -137,9 +137,8 @@ def ssp_export(
 @click.option("-o", "out", metavar="SYSTEM.toml", required=True, help="The file to write.")
 def ssp_import(file: str, out: str) -> None:
     """Write a package as a system file, its FMUs beside it."""
-    from terrafix.cosim.exchange.fmi.write.export import checked_target
     from terrafix.cosim.exchange.ssp.reading import import_ssp
 
-    target = checked_target(out, ".toml")
+    target = writable_target(out, (".toml",))
     folder = import_ssp(file, target)
     print(f"wrote {target} and {folder}", file=sys.stderr)

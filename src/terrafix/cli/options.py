@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.files import writable_target
 
 if TYPE_CHECKING:
     from terrafix.cosim.system.system import System
@@ -55,25 +55,8 @@ def target_of(option: str, text: str | None, suffixes: tuple[str, ...]) -> Path 
         return None
     if not text.strip():
         raise ConfigurationError(f"{option} names no file\n  name one, or leave {option} out")
-    path = Path(text)
-    if path.suffix.lower() not in suffixes:
-        raise ConfigurationError(
-            f"{option} '{text}' is no {' or '.join(suffixes)} file\n"
-            f"  its ending says what is written: name it '{path.with_suffix(suffixes[0]).name}'"
-        )
-    probe = path.with_name(f".{path.name}.{os.getpid()}.probe")
-    try:
-        if path.is_dir():
-            raise ConfigurationError(f"{option} '{text}' is a folder; name a file in it")
-        if not path.parent.is_dir():
-            raise ConfigurationError(
-                f"cannot write {option} '{text}': there is no folder '{path.parent}'"
-            )
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ConfigurationError(f"cannot write {option} '{text}': {error.strerror}") from error
-    return path
+    reason = "its ending says what is written: "
+    return writable_target(text, suffixes, option=option, reason=reason)
 
 
 def read(path: str, settings: Settings, *, outside: bool = False) -> System:
