@@ -53,7 +53,7 @@ def _campaign(runs: int, case: str, *, seed: int = 2008, sets: Any = (), **optio
 def _with_records() -> Any:
     """The open loop with truth and estimate recorded at 1 Hz."""
     from terrafix.cosim.basics.clock import Rate
-    from terrafix.cosim.files.reading import read_system
+    from terrafix.cosim.files.readers import read_system
 
     system = read_system(SYSTEM, [("case", "TC-1")])
     system.records.clear()
@@ -213,7 +213,7 @@ def wrong_model(scale: float) -> dict[str, Any]:
 
 
 def _against_lincov(result: Any, case: str, sets: Any) -> dict[str, Any]:
-    from terrafix.cosim.files.reading import read_system
+    from terrafix.cosim.files.readers import read_system
     from terrafix.cosim.lincov.deviations import linear_covariance
 
     began = time.perf_counter()
@@ -324,7 +324,8 @@ def main() -> None:
     if arguments.measure:
         print(json.dumps(MEASURES[arguments.measure](arguments.scale)))
         return
-    from terrafix.cosim.records.results import cpu_name, versions
+    from terrafix.cosim.basics.machine import cpu_name
+    from terrafix.cosim.records.results import versions
 
     print(f"{cpu_name()}, {os.cpu_count()} processors; {versions()}")
     scale = 0.05 if arguments.quick else 1.0

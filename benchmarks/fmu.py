@@ -26,7 +26,7 @@ from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.fmi.run.fleet import Fleet, Group, Setup
 from terrafix.cosim.exchange.fmi.run.reading import read_interface
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.system.system import System
 from terrafix.models.core.model import Model

@@ -22,7 +22,7 @@ import numpy as np
 import terrafix.cosim.kernels
 from terrafix.cosim.basics.noise import stream_key
 from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
 
 SOURCE = Path(__file__).with_name("open_loop.c")

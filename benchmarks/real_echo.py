@@ -26,7 +26,7 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import Input, MessageOutput
 from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
 from terrafix.models.filters.spacecraft import REASONS as JUDGED
 from terrafix.models.filters.spacecraft import navigation_error_array

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import inertial_from_earth_fixed_array
 from terrafix.models.motion.ephemeris import Ephemeris, read_eof

@@ -21,12 +21,13 @@ from statistics import median
 import numpy as np
 
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.machine import cpu_name
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Input, Output
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
-from terrafix.cosim.files.reading import read_system
-from terrafix.cosim.records.results import cpu_name, versions
+from terrafix.cosim.files.readers import read_system
+from terrafix.cosim.records.results import versions
 from terrafix.cosim.system.system import System
 
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_open_loop.toml"

@@ -39,12 +39,14 @@ NAVIGATION = {
     *("latitude", "longitude", "lvlh", "mekf", "navigation", "orbit", "quaternion", "radar"),
     *("sar", "satellite", "spacecraft", "terrain", "velocity"),
 }
+LATE = "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy psutil"
 HEAVY = {
-    "terrafix": "numpy casadi scipy xarray pint matplotlib netCDF4 rich click cv2 fmpy",
-    "terrafix.cosim.system.system": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
-    "terrafix.cosim.engine.run": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
-    "terrafix.cosim.files.reading": "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
-    "terrafix.cli": "numpy casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy",
+    "terrafix": f"numpy click {LATE}",
+    "terrafix.cosim.system.system": LATE,
+    "terrafix.cosim.engine.run": LATE,
+    "terrafix.cosim.files.reading": LATE,
+    "terrafix.cosim.files.readers": LATE,
+    "terrafix.cli": f"numpy {LATE}",
 }
 
 

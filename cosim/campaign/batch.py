@@ -39,7 +39,7 @@ class FileSource:
 
     def read(self) -> System:
         """Read the file."""
-        from terrafix.cosim.files.reading import read_system
+        from terrafix.cosim.files.readers import read_system
 
         return read_system(self.path, list(self.settings))
 

@@ -14,6 +14,8 @@ from typing import Any
 
 from terrafix.cosim.basics.clock import Exact, seconds, text_seconds
 from terrafix.cosim.basics.errors import ConfigurationError, RateError, StepError, TerrafixError
+from terrafix.cosim.basics.files import write_atomically
+from terrafix.cosim.basics.machine import processors
 from terrafix.cosim.campaign import pools
 from terrafix.cosim.campaign.batch import (
     BlockResult,
@@ -28,7 +30,6 @@ from terrafix.cosim.campaign.statistics.statistic import BLOCK
 from terrafix.cosim.campaign.store import RESULT, SUMMARY, Store
 from terrafix.cosim.campaign.verdict import judge
 from terrafix.cosim.engine.simulation import MAX_MEMBER, Simulation
-from terrafix.cosim.records.recorder import write_atomically
 from terrafix.cosim.system.identity import configuration
 from terrafix.cosim.system.system import System
 
@@ -295,7 +296,7 @@ def _batches(
     missing: list[int], size: int, runs: int, workers: int | None, dask: str | None
 ) -> list[pools.Batch]:
     """Consecutive blocks together, up to `size` members; enough batches that nobody is idle."""
-    n_workers = workers or pools.processors()
+    n_workers = workers or processors()
     share = -(-len(missing) // n_workers) * BLOCK
     largest = min(size, share) if dask is None and len(missing) * BLOCK > size else size
     per_batch = max(1, largest // BLOCK)
@@ -321,7 +322,7 @@ def _flown(
 ) -> tuple[Iterable[list[BlockResult]], str]:
     if dask is not None:
         return pools.on_dask(task, batches, address=dask, started=started), f"Dask at {dask}"
-    count = workers or pools.processors()
+    count = workers or processors()
     if len(batches) == 1 or count == 1:
         text = "this process" + (f", {count} threads" if count > 1 else "")
         return pools.in_this_process(task, batches, threads=count), text

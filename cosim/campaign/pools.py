@@ -31,13 +31,6 @@ MOST_LOSSES = 3
 CONNECT_SECONDS = 5
 
 
-def processors() -> int:
-    """Processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def in_this_process(task: Task, batches: Sequence[Batch], *, threads: int) -> Flown:
     """Fly one batch after the other; members are stepped in threads."""
     before = os.environ.get("TERRAFIX_THREADS")

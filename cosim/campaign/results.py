@@ -43,7 +43,8 @@ class CampaignResult(Outcome):
 
 def summary_of(result: CampaignResult) -> dict[str, Any]:
     """Plain types for JSON; by evaluation component where there are several."""
-    from terrafix.cosim.records.results import cpu_name, versions
+    from terrafix.cosim.basics.machine import cpu_name
+    from terrafix.cosim.records.results import versions
 
     each = {
         path: s.summary() | {"verdict": result.verdicts[path].summary()}
@@ -93,7 +94,8 @@ def build_result(result: CampaignResult) -> xarray.Dataset:
 
 
 def _attributes(result: CampaignResult) -> dict[str, Any]:
-    from terrafix.cosim.records.results import cpu_name, versions
+    from terrafix.cosim.basics.machine import cpu_name
+    from terrafix.cosim.records.results import versions
 
     verdicts: Mapping[str, Any] = {p: v.summary() for p, v in result.verdicts.items()}
     plain = {

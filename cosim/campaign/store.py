@@ -20,9 +20,9 @@ from typing import IO, Any
 import numpy as np
 
 from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError
+from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.campaign.batch import BlockResult
 from terrafix.cosim.records.places import locked
-from terrafix.cosim.records.recorder import write_atomically
 from terrafix.cosim.system.identity import first_difference
 
 SCHEMA = "terrafix-campaign/1"

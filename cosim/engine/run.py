@@ -22,7 +22,7 @@ from terrafix.cosim.basics.errors import (
 )
 from terrafix.cosim.engine.simulation import Progress, Result, Simulation
 from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
-from terrafix.cosim.records.places import Places, writable
+from terrafix.cosim.records.places import Places, result_target
 from terrafix.cosim.system.system import System
 
 SLICES = 400  # progress reports per run
@@ -84,10 +84,10 @@ def simulate(
     if not isinstance(system, System):
         raise ConfigurationError(
             f"simulate takes a System, not {type(system).__name__}\n"
-            "  read a file with terrafix.cosim.files.reading.read_system"
+            "  read a file with terrafix.cosim.files.readers.read_system"
         )
     length = _duration(system, duration)
-    out = None if out is None else writable(Path(out))
+    out = None if out is None else result_target(out)
     every = None if checkpoint_every is None else seconds(checkpoint_every, "checkpoint interval")
     if every is not None and every <= 0:
         raise RateError(f"checkpoint interval is {text_seconds(every)} s; it must be positive")

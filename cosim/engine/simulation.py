@@ -296,7 +296,8 @@ class Simulation:
 
     def attributes(self, status: str) -> dict[str, Any]:
         """What is stored with every result."""
-        from terrafix.cosim.records.results import cpu_name, versions
+        from terrafix.cosim.basics.machine import cpu_name
+        from terrafix.cosim.records.results import versions
 
         return {
             "system": self.system.name,

@@ -67,17 +67,10 @@ _CONNECTION = re.compile(r"\s*([\w.]+)\s*->\s*([\w.]+)\s*(?:\(\s*delay\s+([^)]+?
 _PORT = re.compile(r"[A-Za-z]\w*(?:\.\w+)+")
 
 
-def read_system(path: str | Path, settings: Settings = (), *, outside: bool = False) -> System:
+def read_toml(path: Path, settings: Settings = (), *, outside: bool = False) -> System:
     """Read a system from a TOML file, apply settings, and check it whole.
 
-    Parameters
-    ----------
-    path : path
-    settings : sequence of (str, str)
-        ``("orbit.gravity", "j2")``, as ``--set`` gives them; applied after the file and its
-        choices. Numbers without a unit are in the declared (SI) unit.
-    outside : bool
-        Whether exposed inputs are driven from outside, as in an exported system.
+    What it takes is explained in `terrafix.cosim.files.readers.read_system`.
 
     Raises
     ------
@@ -86,7 +79,6 @@ def read_system(path: str | Path, settings: Settings = (), *, outside: bool = Fa
     SystemCheckError
         With every mistake in it.
     """
-    path = Path(path)
     system, load = _load((path,), settings)
     problems = list(load.problems)
     try:

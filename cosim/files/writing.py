@@ -8,6 +8,7 @@ from typing import Any
 
 from terrafix.cosim.basics.clock import Rate, text_seconds
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.declare.parameters import PATHS
 from terrafix.cosim.declare.registry import component_entries
 from terrafix.cosim.files.reading import SCHEMA
@@ -24,9 +25,11 @@ def write_system(system: System, path: str | Path) -> None:
     Raises
     ------
     ConfigurationError
-        If a component's type is not registered, or two would have the same name.
+        If a component's type is not registered, two would have the same name, or the file cannot
+        be written.
     """
-    Path(path).write_text(system_text(system), encoding="utf-8")
+    text = system_text(system).encode()
+    write_atomically(Path(path), lambda f: f.write(text))
 
 
 def system_text(system: System) -> str:

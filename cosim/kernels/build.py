@@ -15,12 +15,12 @@ on the rest (in practice they call the same one). Callers need not know which th
 from __future__ import annotations
 
 import ctypes
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any, NamedTuple
 
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.machine import processors
 from terrafix.cosim.kernels import toolchain
 from terrafix.cosim.kernels.base import Argument, BoundKernel, Kernel, Result, Specification
 from terrafix.cosim.kernels.compiled import CompiledKernel, kernel_source
@@ -69,7 +69,7 @@ def build_kernels(
         return virtual
     candidates = [_candidates(kernel) for kernel in virtual]
     loaded: dict[str, _Loaded] = {}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(processors()) as pool:
         todo = {c.source: c for found in candidates for c in found[:1]}
         while todo:
             futures = {

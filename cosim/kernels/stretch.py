@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.machine import processors
 from terrafix.cosim.kernels import toolchain
 from terrafix.cosim.kernels.base import BoundArrays, Kernel
 from terrafix.cosim.kernels.compiled import EXPORT
@@ -133,9 +134,7 @@ def available_threads() -> int:
     chosen = os.environ.get("TERRAFIX_THREADS", "")
     if chosen.isdigit() and int(chosen) > 0:
         return int(chosen)
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return processors()
 
 
 class Stretch:

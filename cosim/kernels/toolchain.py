@@ -34,6 +34,7 @@ from pathlib import Path
 from typing import Protocol
 
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
+from terrafix.cosim.basics.machine import cpu_features
 
 FLAGS = ("-O1", "-ftree-vectorize", "-fno-math-errno", "-ffp-contract=off")
 """No contraction, no reassociation: the virtual machine's bits.
@@ -320,21 +321,10 @@ def load(source: str, *, native: bool = False) -> ctypes.CDLL:
     raise CompilationError(_why_none())
 
 
-@functools.cache
-def _processor() -> str:
-    """What this processor can do, as far as the system tells: native code is for it alone."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        told = {line for line in lines if line.startswith(("model name", "flags", "Features"))}
-        return "\n".join(sorted(told))
-    except OSError:
-        return platform.processor()
-
-
 def _load(source: str, compiler: Compiler, *, native: bool) -> ctypes.CDLL:
     options = compiler.options(native=native)
     parts = (source, compiler.version, *options, sys.platform, platform.machine())
-    parts += (_processor(),) if native else ()
+    parts += (cpu_features(),) if native else ()
     key = sha256("\0".join(parts).encode()).hexdigest()
     for directory in _directories():
         for path in directory.glob(f"{key}-*{_SUFFIX}"):

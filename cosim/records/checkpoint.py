@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from terrafix.cosim.basics.errors import CheckpointError
-from terrafix.cosim.records.recorder import write_atomically
+from terrafix.cosim.basics.files import write_atomically
 
 SCHEMA = "terrafix-checkpoint/1"
 

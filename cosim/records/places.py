@@ -10,25 +10,12 @@ from pathlib import Path
 from typing import IO, Any
 
 from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError, TerrafixError
+from terrafix.cosim.basics.files import writable_target
 
 
-def writable(out: Path) -> Path:
+def result_target(out: str | Path) -> Path:
     """Return `out`, or raise ConfigurationError if no result can be written there."""
-    try:
-        if out.is_dir():
-            raise ConfigurationError(f"'{out}' is a folder; name a file in it")
-        if out.suffix != ".nc":
-            raise ConfigurationError(
-                f"'{out}' is no .nc file\n  results are NetCDF: name it '{out.stem}.nc'"
-            )
-        if not out.parent.is_dir():
-            raise ConfigurationError(f"cannot write '{out}': there is no folder '{out.parent}'")
-        probe = out.with_name(f".{out.name}.probe")
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ConfigurationError(f"cannot write '{out}': {error.strerror or error}") from error
-    return out
+    return writable_target(out, (".nc",), reason="results are NetCDF: ")
 
 
 @dataclass
@@ -80,7 +67,7 @@ class Places:
         """Places of a run that continues: its records, and its result unless told otherwise."""
         told = saved["places"]
         if out is None and told["out"] is not None:
-            out = writable(resume.parent / told["out"])
+            out = result_target(resume.parent / told["out"])
         folder = resume.parent / told["folder"]
         return cls(out, resume, folder, _had_result=out is not None and out.exists())
 

@@ -8,7 +8,6 @@ at the end the chunks become labeled arrays (`terrafix.cosim.records.results`).
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.memory.messages import MessageSlot
@@ -236,27 +236,6 @@ def _read_chunk(file: Path) -> tuple[NDArray[np.float64], list[NDArray[Any]]]:
 
 def _read_chunks(folder: Path, name: str) -> list[tuple[NDArray[np.float64], list[NDArray[Any]]]]:
     return [_read_chunk(file) for file in chunk_files(folder, name)]
-
-
-def write_atomically(target: Path, write: Any) -> None:
-    """Write a file under another name first, so that it is whole or absent.
-
-    Raises
-    ------
-    ConfigurationError
-        If the folder cannot be written.
-    """
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            write(file)
-        partial.replace(target)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise ConfigurationError(
-            f"cannot write '{target}': {error.strerror or error}\n"
-            "  choose another place, or make room"
-        ) from error
 
 
 def write_manifest(folder: Path, recorders: list[Recorder], about: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.files import replacing
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.records.recorder import MANIFEST, Recorder, Variable, _join, _read_chunks
 from terrafix.cosim.records.recorder import SCHEMA as RECORDS_SCHEMA
@@ -48,17 +49,6 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
-
-
-def cpu_name() -> str:
-    """Type of the processor, as far as the system tells."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
 
 
 class _Labels:
@@ -149,16 +139,11 @@ def from_recorders(recorders: list[Recorder]) -> dict[str, Any]:
 
 def write_netcdf(dataset: xarray.Dataset, path: Path) -> None:
     """Write a dataset to a NetCDF-4 file, whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        dataset.to_netcdf(partial, engine="netcdf4", format="NETCDF4")
-        partial.replace(path)
-    except (OSError, RuntimeError) as error:  # the library reports a full disk as the latter
-        partial.unlink(missing_ok=True)
-        cause = getattr(error, "strerror", None) or str(error)
-        raise ConfigurationError(
-            f"cannot write '{path}': {cause}\n  choose another place, or make room"
-        ) from error
+    with replacing(path) as partial:
+        try:
+            dataset.to_netcdf(partial, engine="netcdf4", format="NETCDF4")
+        except RuntimeError as error:  # how the library reports a full disk
+            raise OSError(str(error)) from error
 
 
 def read_result(path: str | Path) -> xarray.Dataset:

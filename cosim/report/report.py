@@ -46,7 +46,7 @@ def predict(campaign: Campaign) -> None:
 
 def _system(campaign: Campaign) -> Any:
     """The system that was flown, if its file still says the same."""
-    from terrafix.cosim.files.reading import read_system
+    from terrafix.cosim.files.readers import read_system
     from terrafix.cosim.system.check import check
     from terrafix.cosim.system.identity import configuration
 
@@ -79,15 +79,11 @@ def write_report(
     ConfigurationError
         If the result cannot be read or the page cannot be written.
     """
-    from terrafix.cosim.records.recorder import write_atomically
+    from terrafix.cosim.basics.files import writable_target, write_atomically
     from terrafix.cosim.report.page import page
 
     campaign = read_campaign(result)
-    path = campaign.folder / "report.html" if target is None else Path(target)
-    if path.is_dir():
-        raise ConfigurationError(f"'{path}' is a folder; name a file in it")
-    if not path.parent.is_dir():
-        raise ConfigurationError(f"cannot write '{path}': there is no folder '{path.parent}'")
+    path = writable_target(campaign.folder / "report.html" if target is None else target)
     if analyze:
         predict(campaign)
     text = page(campaign).encode()

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from terrafix.cosim.engine.simulation import Simulation as Simulation
     from terrafix.cosim.exchange.fmi.check.check import check_fmu as check_fmu
     from terrafix.cosim.exchange.fmi.write.export import export_fmu as export_fmu
-    from terrafix.cosim.files.reading import read_system as read_system
+    from terrafix.cosim.files.readers import read_system as read_system
     from terrafix.cosim.files.writing import write_system as write_system
     from terrafix.cosim.kernels.symbolic import SymbolicComponent as SymbolicComponent
     from terrafix.cosim.lincov.deviations import linear_covariance as linear_covariance
@@ -99,7 +99,7 @@ _FROM = {
     "RunError": "cosim.engine.run",
     "Simulation": "cosim.engine.simulation",
     "Result": "cosim.engine.simulation",
-    "read_system": "cosim.files.reading",
+    "read_system": "cosim.files.readers",
     "write_system": "cosim.files.writing",
     "read_result": "cosim.records.results",
     "run_campaign": "cosim.campaign.campaign",

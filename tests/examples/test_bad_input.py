@@ -23,7 +23,7 @@ from terrafix.cli import main
 from terrafix.cosim.basics.errors import SystemCheckError, TerrafixError
 from terrafix.cosim.engine.master import Master
 from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 OPEN_LOOP = (EXAMPLES / "spacecraft_sar_open_loop.toml").read_text()

@@ -7,7 +7,7 @@ import pytest
 
 from terrafix.cosim.basics.ensembles import chi_square_interval
 from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 
 SYSTEM = Path(__file__).parents[2] / "examples" / "spacecraft_sar_open_loop.toml"
 

@@ -15,7 +15,7 @@ import pytest
 import xarray
 
 from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.records.results import read_result
 
 SYSTEM = Path(__file__).parents[2] / "examples" / "spacecraft_sar_open_loop.toml"

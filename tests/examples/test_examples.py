@@ -14,7 +14,7 @@ import xarray
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.files.writing import write_system
 from terrafix.cosim.system.check import check
 from terrafix.cosim.system.identity import configuration

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 
 SYSTEM = Path(__file__).parents[2] / "examples" / "spacecraft_sar_open_loop.toml"
 QUANTITIES = ("position", "velocity", "misalignment")

@@ -17,12 +17,13 @@ import numpy as np
 
 from terrafix.cosim.basics.clock import Rate, text_seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
+from terrafix.cosim.basics.files import writable_target
 from terrafix.cosim.basics.units import base_units
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.fmi.run.reading import ImportedPort, Interface, read_interface
 from terrafix.cosim.exchange.fmi.write.description import number
-from terrafix.cosim.exchange.fmi.write.export import checked_target, export_fmu, write_archive
+from terrafix.cosim.exchange.fmi.write.export import export_fmu, write_archive
 from terrafix.cosim.exchange.ssp.names import (
     OMS,
     OPEN_SIMULATION,
@@ -92,7 +93,7 @@ def export_ssp(
     ConfigurationError
         If something cannot be carried; it is named, and nothing is written.
     """
-    target = checked_target(path, ".ssp")
+    target = writable_target(path, (".ssp",))
     plan = check(system, outside=True)
     for name in leave_out:
         if name not in plan.flat.components:

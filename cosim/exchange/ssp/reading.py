@@ -20,10 +20,13 @@ from xml.etree import ElementTree as ET
 
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError, nearest
+from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.exchange.fmi.run.archive import checked_xml, unpack
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.ssp.linear import Linear
 from terrafix.cosim.exchange.ssp.names import OSP, OWN, SSD, SSV, tag
+from terrafix.cosim.files.choices import Settings
+from terrafix.cosim.files.writing import system_text
 from terrafix.cosim.system.system import System
 
 STRUCTURE = "SystemStructure.ssd"
@@ -58,20 +61,35 @@ class _Structure:
     outside: dict[str, tuple[str, End]] = field(default_factory=dict)
 
 
-def read_ssp(path: str | Path, *, folder: Path | None = None) -> System:
+def read_ssp(
+    path: str | Path,
+    settings: Settings = (),
+    *,
+    outside: bool = False,  # noqa: ARG001 - nothing is checked before it runs
+    folder: Path | None = None,
+) -> System:
     """Read a package as a system.
 
     Parameters
     ----------
     path : path
+    settings : sequence of (str, str)
+        None: a package takes none.
+    outside : bool
+        As every reader; its inputs may be driven either way.
     folder : Path, optional
         Where its FMUs are kept; a folder of this process alone if absent.
 
     Raises
     ------
     ConfigurationError
-        If it is no package, damaged, unsafe, or uses what terrafix does not read.
+        If it is no package, damaged, unsafe, or uses what terrafix does not read; or for settings.
     """
+    if settings:
+        raise ConfigurationError(
+            f"--set does not reach into '{path}'\n"
+            "  terrafix ssp import writes it as a system file, where everything can be set"
+        )
     file = Path(path)
     if not file.is_file():
         raise ConfigurationError(f"there is no SSP package '{path}'")
@@ -98,8 +116,6 @@ def import_ssp(path: str | Path, target: Path) -> Path:
     ConfigurationError
         As `read_ssp`; or if the folder is there already.
     """
-    from terrafix.cosim.files.writing import system_text
-
     folder = target.with_name(f"{target.stem}_package")
     if folder.exists():
         raise ConfigurationError(
@@ -111,7 +127,8 @@ def import_ssp(path: str | Path, target: Path) -> Path:
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
-    target.write_text(text.replace(f"{folder.resolve()}", folder.name), encoding="utf-8")
+    content = text.replace(f"{folder.resolve()}", folder.name).encode()
+    write_atomically(target, lambda f: f.write(content))
     return folder
 
 

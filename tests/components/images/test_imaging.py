@@ -14,7 +14,7 @@ from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.basics.machine import available_memory
 from terrafix.cosim.engine.run import RunError, simulate
 from terrafix.cosim.engine.simulation import Simulation
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
 from terrafix.cosim.system.system import System
 from terrafix.models.images.matching import REASONS

@@ -12,7 +12,7 @@ import pytest
 
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.models.geometry.earth import EARTH
 
 ROOT = Path(__file__).parents[3]

@@ -9,7 +9,7 @@ from campaign_parts import Filter, Judge, scalar_system
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.campaign.campaign import run_campaign
 from terrafix.cosim.declare.parameters import Parameter
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.lincov import deviations
 from terrafix.cosim.lincov.deviations import linear_covariance
 from terrafix.cosim.lincov.prediction import LinearCovariance

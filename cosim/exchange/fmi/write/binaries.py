@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
+from terrafix.cosim.basics.machine import processors
 from terrafix.cosim.exchange.fmi.run.platforms import PLATFORMS, Platform, host_platform
 from terrafix.cosim.kernels.toolchain import FLAGS, working_compiler
 
@@ -68,7 +69,7 @@ def build(
     order = sorted(compiled, key=lambda name: -len(files[name]))  # the longest first
     with (
         tempfile.TemporaryDirectory(prefix="terrafix-fmu-") as folder,
-        ThreadPoolExecutor(os.cpu_count()) as pool,
+        ThreadPoolExecutor(processors()) as pool,
     ):
         here = Path(folder)
         for name, text in files.items():

@@ -11,7 +11,6 @@ symbolic becomes one FMU with its schedule inside and its exposed ports outside.
 
 from __future__ import annotations
 
-import os
 import re
 import zipfile
 from collections.abc import Mapping
@@ -23,6 +22,7 @@ import numpy as np
 
 from terrafix.cosim.basics.clock import text_seconds
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError, nearest
+from terrafix.cosim.basics.files import replacing, writable_target
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.engine.master import Master
 from terrafix.cosim.exchange.fmi.run.component import Fmu
@@ -112,7 +112,7 @@ def export_fmu(
     SystemCheckError
         If the system has problems.
     """
-    target = checked_target(path)
+    target = writable_target(path, (".fmu",))
     if fmi not in (2, 3):
         raise ConfigurationError(f"there is no FMI {fmi}\n  write 2 or 3")
     chosen = chosen_platforms(platforms)
@@ -173,47 +173,17 @@ _ICONS = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-def checked_target(path: str | Path, suffix: str = ".fmu") -> Path:
-    """The file to write, refused before any work if it cannot be written.
-
-    Raises
-    ------
-    ConfigurationError
-        If it has another ending, is a folder, or its folder does not exist or is read-only.
-    """
-    target = Path(path)
-    if target.suffix.lower() != suffix:
-        raise ConfigurationError(
-            f"'{path}' is no {suffix} file\n  name it '{target.with_suffix(suffix).name}'"
-        )
-    if target.is_dir():
-        raise ConfigurationError(f"'{path}' is a folder; name a file in it")
-    folder = target.parent
-    if not folder.is_dir():
-        raise ConfigurationError(f"cannot write '{path}': there is no folder '{folder}'")
-    probe = target.with_name(f".{target.name}.{os.getpid()}.probe")
-    try:
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ConfigurationError(f"cannot write '{path}': {error.strerror}") from error
-    return target
-
-
 def write_archive(target: Path, content: Mapping[str, bytes]) -> None:
     """Write the archive beside its place, then move it there."""
-    draft = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, data in content.items():
-                info = zipfile.ZipInfo(name, _DATE)
-                info.compress_type = zipfile.ZIP_DEFLATED
-                info.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
-                archive.writestr(info, data)
-        draft.replace(target)
-    except OSError as error:
-        draft.unlink(missing_ok=True)
-        raise ConfigurationError(f"cannot write '{target}': {error.strerror}") from error
+    with (
+        replacing(target) as partial,
+        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
+        for name, data in content.items():
+            info = zipfile.ZipInfo(name, _DATE)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            info.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
+            archive.writestr(info, data)
 
 
 def laid_out(source: Source, version: int) -> Layout:

@@ -30,7 +30,7 @@ from terrafix.cosim.exchange.fmi.run.binding import (
 )
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
 
 COMPONENTS = (

@@ -24,7 +24,7 @@ from terrafix.cosim.exchange.fmi.run.binding import MODEL_EXCHANGE
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.fmi.run.loop import FmuLoop
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.files.writing import write_system
 from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
 from terrafix.cosim.system.check import check

@@ -19,7 +19,7 @@ from terrafix.cosim.exchange.fmi.check.checks import Subject
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 
 NAMES = (
     *("orbit", "attitude", "antenna", "ads", "imu"),

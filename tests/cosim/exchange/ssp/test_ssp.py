@@ -19,7 +19,7 @@ from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
 from terrafix.cosim.exchange.ssp.export import export_ssp
 from terrafix.cosim.exchange.ssp.reading import import_ssp, read_ssp
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
 
 SSD = "http://ssp-standard.org/SSP1/SystemStructureDescription"

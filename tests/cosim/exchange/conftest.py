@@ -7,7 +7,7 @@ import pytest
 from fmu_helpers import OPEN_LOOP
 
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,66 @@
+"""What commands share: the system they take, its settings, the files they write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.files import writable_target
+
+if TYPE_CHECKING:
+    from terrafix.cosim.system.system import System
+
+Settings = tuple[tuple[str, str], ...]
+
+
+def _pairs(
+    context: click.Context,  # noqa: ARG001 - click's signature
+    parameter: click.Parameter,  # noqa: ARG001
+    values: tuple[str, ...],
+) -> Settings:
+    pairs = []
+    for text in values:
+        path, equals, value = text.partition("=")
+        if not equals or not path.strip():
+            raise ConfigurationError(
+                f"--set '{text}' sets nothing\n  write --set PATH=VALUE, as in --set duration=10"
+            )
+        pairs.append((path.strip(), value.strip()))
+    return tuple(pairs)
+
+
+system_argument = click.argument("system", metavar="SYSTEM.toml")
+set_option = click.option(
+    "--set",
+    "settings",
+    metavar="PATH=VALUE",
+    multiple=True,
+    callback=_pairs,
+    help="Set a parameter, a choice or a key of the system; may be given again.",
+)
+seed_option = click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Root seed.")
+duration_option = click.option(
+    "--duration", metavar="S", help='Simulated time, exact: "590.4" or "10 min".'
+)
+quiet_option = click.option("--quiet", is_flag=True, help="Nothing but errors on standard error.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+
+
+def target_of(option: str, text: str | None, suffixes: tuple[str, ...]) -> Path | None:
+    """The file an option names, refused now if it could not be written later."""
+    if text is None:
+        return None
+    if not text.strip():
+        raise ConfigurationError(f"{option} names no file\n  name one, or leave {option} out")
+    reason = "its ending says what is written: "
+    return writable_target(text, suffixes, option=option, reason=reason)
+
+
+def read(path: str, settings: Settings, *, outside: bool = False) -> System:
+    """Read the system that a command takes."""
+    from terrafix.cosim.files.readers import read_system
+
+    return read_system(path, settings, outside=outside)
