@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from terrafix.cosim.campaign.campaign import CampaignError as CampaignError
     from terrafix.cosim.campaign.campaign import run_campaign as run_campaign
     from terrafix.cosim.campaign.results import CampaignResult as CampaignResult
+    from terrafix.cosim.campaign.statistics.ensemble import STATISTICS as STATISTICS
+    from terrafix.cosim.campaign.statistics.statistic import Statistic as Statistic
     from terrafix.cosim.declare.component import Component as Component
     from terrafix.cosim.declare.evaluation import Evaluation as Evaluation
     from terrafix.cosim.declare.evaluation import Quantity as Quantity
@@ -105,6 +107,8 @@ _FROM = {
     "run_campaign": "cosim.campaign.campaign",
     "CampaignError": "cosim.campaign.campaign",
     "CampaignResult": "cosim.campaign.results",
+    "STATISTICS": "cosim.campaign.statistics.ensemble",
+    "Statistic": "cosim.campaign.statistics.statistic",
     "linear_covariance": "cosim.lincov.deviations",
     "LinearCovariance": "cosim.lincov.prediction",
     "export_fmu": "cosim.exchange.fmi.write.export",
