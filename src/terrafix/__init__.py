@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     from terrafix.cosim.files.reading import read_system as read_system
     from terrafix.cosim.files.writing import write_system as write_system
     from terrafix.cosim.kernels.symbolic import SymbolicComponent as SymbolicComponent
-    from terrafix.cosim.lincov.deviations import LinearCovariance as LinearCovariance
     from terrafix.cosim.lincov.deviations import linear_covariance as linear_covariance
+    from terrafix.cosim.lincov.prediction import LinearCovariance as LinearCovariance
     from terrafix.cosim.memory.fields import Field as Field
     from terrafix.cosim.records.results import read_result as read_result
     from terrafix.cosim.system.dispersion import Dispersion as Dispersion
@@ -106,7 +106,7 @@ _FROM = {
     "CampaignError": "cosim.campaign.campaign",
     "CampaignResult": "cosim.campaign.results",
     "linear_covariance": "cosim.lincov.deviations",
-    "LinearCovariance": "cosim.lincov.deviations",
+    "LinearCovariance": "cosim.lincov.prediction",
     "export_fmu": "cosim.exchange.fmi.write.export",
     "check_fmu": "cosim.exchange.fmi.check.check",
     "TerrafixError": "cosim.basics.errors",
