@@ -25,7 +25,7 @@ the mean is the truth's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,31 +131,30 @@ class _Analysis:
     def _advance(self, end: int) -> None:
         """Fly to the next tick; or a stretch of ticks, noting those whose Jacobians serve all."""
         master = self._simulation.master
-        pending = [(g.next_tick, g) for g in master.agenda.groups if g.next_tick is not None]
+        groups = master.agenda.groups
+        pending = [(g.next_tick, i) for i, g in enumerate(groups) if g.next_tick is not None]
         first = min((tick for tick, _ in pending), default=end + 1)
         if first > end:
             master.run_until(end)
             return
-        due = [g for tick, g in pending if tick == first]
+        due = [number for tick, number in pending if tick == first]
         self._note(first, 1)
-        group = due[0]
-        if len(due) > 1 or not group.spacing or not self._regular(group):
+        spacing = groups[due[0]].spacing
+        if len(due) > 1 or not spacing or not self._regular(due[0]):
             return
-        others = [tick for tick, g in pending if g is not group]
-        last = min([end, *(tick - 1 for tick in others)])
-        n_blocks = ((last - first) // group.spacing - 1) // EVERY
+        last = min([end, *(tick - 1 for tick, number in pending if number != due[0])])
+        n_blocks = ((last - first) // spacing - 1) // EVERY
         for k in range(n_blocks):
-            before = first + (k * EVERY + EVERY // 2) * group.spacing
+            before = first + (k * EVERY + EVERY // 2) * spacing
             master.run_until(before)
-            self._note(before + group.spacing, EVERY)
+            self._note(before + spacing, EVERY)
         if n_blocks > 0:
-            master.run_until(first + n_blocks * EVERY * group.spacing)
+            master.run_until(first + n_blocks * EVERY * spacing)
 
-    def _regular(self, group: Any) -> bool:
+    def _regular(self, number: int) -> bool:
         """Whether the components that step with a group publish signals alone."""
-        master, linear = self._simulation.master, self._layout.linear
-        number = master.agenda.groups.index(group)
-        mine = [p for p, n in master.group_of.items() if n == number]
+        linear, group_of = self._layout.linear, self._simulation.master.group_of
+        mine = [path for path, group in group_of.items() if group == number]
         return bool(mine) and all(p in linear and not linear[p].component.messages for p in mine)
 
     def _note(self, tick: int, repeat: int) -> None:

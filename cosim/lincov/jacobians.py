@@ -195,8 +195,12 @@ def _jacobian(linear: Linear, step: Any, *, start: bool) -> tuple[Any, list[str]
     by = [symbols[f"state:{n}"] for n in linear.states if not start]
     by += [symbols[n] for n in (*linear.inputs, *linear.parameters, *linear.noise)]
     jacobian = ca.densify(ca.jacobian(ca.vertcat(*rows), ca.vertcat(*by)))
-    free = {e.element_hash() for e in ca.symvar(jacobian)}
-    needed = [n for n in names if any(e.element_hash() in free for e in symbols[n].elements())]
+
+    def elements(expression: Any) -> set[int]:
+        return {e.element_hash() for e in ca.symvar(expression)}
+
+    free = elements(jacobian)
+    needed = [n for n in names if free & elements(symbols[n])]
     made = ca.Function("jacobian", [symbols[n] for n in needed], [jacobian])
     return made, needed
 

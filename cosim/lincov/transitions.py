@@ -61,7 +61,7 @@ def repeated(f: FloatArray, q: FloatArray, reach: NDArray[np.intp], times: int) 
     reach : ndarray of int, shape (r,)
         Elements that noise reaches: no other element depends on these.
     """
-    inside = np.ix_(range(len(f)), reach, reach)
+    inside = np.ix_(np.arange(len(f)), reach, reach)
 
     def carried(by: FloatArray, covariance: FloatArray) -> FloatArray:
         part = by[inside][:, None]
@@ -83,7 +83,7 @@ def chained(parts: Chain, reach: NDArray[np.intp]) -> Chain:
     """One after the other, the first of the first axis first."""
     product = np.eye(parts.product.shape[-1])
     added = np.zeros(parts.added.shape[1:])
-    small = parts.product[np.ix_(range(len(parts.product)), reach, reach)]
+    small = parts.product[np.ix_(np.arange(len(parts.product)), reach, reach)]
     for k, each in enumerate(parts.product):
         product = each @ product
         added = small[k] @ added @ small[k].T + parts.added[k]
