@@ -15,15 +15,18 @@ from __future__ import annotations
 import json
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError
 from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.campaign.batch import BlockResult
-from terrafix.cosim.records.places import locked
+from terrafix.cosim.records.places import locked, unlock
 from terrafix.cosim.system.identity import first_difference
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
 
 SCHEMA = "terrafix-campaign/1"
 MANIFEST = "campaign.json"
@@ -53,7 +56,7 @@ class Store:
 
     def __init__(self, folder: Path, identity: dict[str, Any], *, resume: bool) -> None:
         self.folder = folder
-        self._lock: IO[str] | None = None
+        self._lock: BaseFileLock | None = None
         self._blocks = folder / "blocks"
         if folder.exists() and not folder.is_dir():
             raise ConfigurationError(f"'{folder}' is a file; a campaign needs a folder")
@@ -122,8 +125,7 @@ class Store:
     def close(self) -> None:
         """Give the folder back."""
         if self._lock is not None:
-            self._lock.close()
-            self.folder.with_suffix(".lock").unlink(missing_ok=True)
+            unlock(self._lock)
             self._lock = None
 
     # ------------------------------------------------------------------ blocks

@@ -279,22 +279,24 @@ def _why_none() -> str:
 
 
 def cache_directory() -> Path:
-    """Directory of compiled libraries: ``TERRAFIX_CACHE``, or the user's cache directory."""
+    """Directory of compiled libraries: ``TERRAFIX_CACHE``, or the user's cache directory.
+
+    Raises
+    ------
+    RuntimeError
+        If the user has no home.
+    """
     chosen = os.environ.get("TERRAFIX_CACHE")
     if chosen:
         return Path(chosen) / "kernels"
-    home = Path("~").expanduser()  # "~" itself for a user without a home
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base = home / "Library" / "Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or home / ".cache"
-    return Path(base) / "terrafix" / "kernels"
+    from platformdirs import user_cache_path
+
+    return user_cache_path("terrafix", appauthor=False, opinion=False) / "kernels"
 
 
 def _directories() -> Iterator[Path]:
-    yield cache_directory()
+    with contextlib.suppress(RuntimeError):  # a user without a home
+        yield cache_directory()
     yield _session_directory()
 
 

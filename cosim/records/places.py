@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import TYPE_CHECKING, Any
 
 from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError, TerrafixError
 from terrafix.cosim.basics.files import writable_target
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
 
 
 def result_target(out: str | Path) -> Path:
@@ -39,7 +43,7 @@ class Places:
     checkpoint: Path
     folder: Path | None
     notes: list[str] = field(default_factory=list)
-    _lock: IO[str] | None = None
+    _lock: BaseFileLock | None = None
     _had_result: bool = False
 
     @classmethod
@@ -121,34 +125,48 @@ class Places:
             return
         if not keep:
             shutil.rmtree(self.folder, ignore_errors=True)
-        self._lock.close()
-        _lock_file(self.folder).unlink(missing_ok=True)
+        unlock(self._lock)
         self._lock = None
 
 
-def _lock_file(folder: Path) -> Path:
-    return folder.with_suffix(".lock")
+def locked(folder: Path) -> BaseFileLock:
+    """Lock the folder for this process alone; the system frees it when we die.
 
+    A lock of the system, not a marker: a marker of a process that died must be taken over by
+    somebody, and two might. Over NFS the server keeps it; where a file system has no locks,
+    filelock falls back to a marker.
 
-def locked(folder: Path) -> IO[str]:
-    """Open the folder's lock file for this process alone; the system frees it when we die."""
-    file = _lock_file(folder).open("w")
+    Raises
+    ------
+    ConfigurationError
+        If another process has it, or nothing can be written beside the folder.
+    """
+    from filelock import FileLock, Timeout
+
+    if not folder.parent.is_dir():  # filelock would make it
+        raise ConfigurationError(f"cannot lock '{folder}': there is no folder '{folder.parent}'")
+    lock = FileLock(folder.with_name(f"{folder.name}.lock"), thread_local=False)
     try:
-        if os.name == "nt":
-            import msvcrt
-
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
+        lock.acquire(blocking=False)
+    except Timeout:
         raise ConfigurationError(
             f"another run is writing its records to '{folder}'\n"
             "  wait for it, or give this one another --out"
         ) from None
-    return file
+    except OSError as error:
+        raise ConfigurationError(f"cannot lock '{folder}': {error.strerror or error}") from error
+    return lock
+
+
+def unlock(lock: BaseFileLock) -> None:
+    """Give a folder back, and remove the lock's file.
+
+    It goes while the lock is held: a lock on a file that is gone is none to filelock. Removed
+    afterwards, it could be the next one's.
+    """
+    with suppress(OSError):  # Windows removes it when it is released
+        Path(lock.lock_file).unlink()
+    lock.release()
 
 
 def rescue(folder: Path) -> Path | None:

@@ -567,6 +567,17 @@ def test_the_cache_lies_where_the_user_says(variables, expected, monkeypatch):
     assert toolchain.cache_directory() == Path(expected)
 
 
+@needs_compiler
+def test_a_user_without_a_home_gets_libraries_too(monkeypatch):
+    def homeless(*_, **__):
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.delenv("TERRAFIX_CACHE", raising=False)
+    monkeypatch.setattr("platformdirs.user_cache_path", homeless)
+    source = '__attribute__((visibility("default"))) double seven(void) { return 7.0; }\n'
+    assert toolchain.load(source)["seven"]
+
+
 # ------------------------------------------------------------------------------------- compilers
 
 
