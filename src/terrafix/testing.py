@@ -208,6 +208,8 @@ class _Source(Component):
 
     row: Callable[[int], dict[str, Any]]
     """Values by field, as the step of this number reads them."""
+    value: Any
+    """The port, which each kind of source declares."""
     ahead: int = 0
     """1 where the input is read at the start of the step: it shows the next step's value."""
 
@@ -220,7 +222,7 @@ class _Source(Component):
     def _publish(self) -> None:
         for name, value in self.row(self.step_index + self.ahead).items():
             if name:
-                setattr(self.value, name, value)  # type: ignore[attr-defined]
+                setattr(self.value, name, value)
             else:
                 self.value = value
 
@@ -229,6 +231,7 @@ class _MessageSource(Component):
     """Publishes given messages, each in the first step at or after its time."""
 
     coming: Sequence[tuple[float, dict[str, Any]]]
+    value: Any
 
     def _initialize_impl(self) -> None:
         self._publish(0.0)
@@ -243,7 +246,7 @@ class _MessageSource(Component):
                 n or "value": np.broadcast_to(v, (self.n_members, *np.shape(v)))
                 for n, v in fields.items()
             }
-            self.value.publish(valid_at, **given)  # type: ignore[attr-defined]
+            self.value.publish(valid_at, **given)
 
 
 def _source(
