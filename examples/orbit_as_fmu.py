@@ -19,10 +19,10 @@ import fmpy
 import numpy as np
 
 import terrafix as tf
-from terrafix.models.geometry.earth import EARTH
-from terrafix.models.geometry.frames import earth_fixed_from_inertial
-from terrafix.models.motion.gravity import j2_acceleration
+from terrafix.models.geometry import earth, frames
+from terrafix.models.motion import gravity
 
+EARTH = earth.EARTH
 SYSTEM = Path(__file__).with_name("spacecraft_sar_open_loop.toml")
 DURATION = "120"
 
@@ -43,14 +43,16 @@ def casadi_orbit(system: tf.System, folder: Path) -> tf.Component:
         return [dae.add(f"{name}[{k + 1}]", *kind, {}) for k in range(3)]
 
     r, v, p = vector("r_i"), vector("v_i"), ca.SX.sym("p", 3)
-    gravity = ca.Function("gravity", [p], [j2_acceleration(p, EARTH.mu, EARTH.radius, EARTH.j2)])
-    acceleration = ca.vertsplit(gravity(ca.vertcat(*r)))
+    a_p = gravity.j2_acceleration(p, EARTH.mu, EARTH.radius, EARTH.j2)
+    acceleration = ca.vertsplit(ca.Function("gravity", [p], [a_p])(ca.vertcat(*r)))
     for state, rate in zip([*r, *v], [*v, *acceleration], strict=True):
         dae.eq(dae.der(state), rate)
     arguments = [ca.SX.sym("r", 3), ca.SX.sym("v", 3), ca.SX.sym("t")]
     angle = EARTH.rotation_rate * arguments[2]
     turn = ca.Function(
-        "turn", arguments, earth_fixed_from_inertial(*arguments[:2], angle, EARTH.rotation_rate)
+        "turn",
+        arguments,
+        frames.earth_fixed_from_inertial(*arguments[:2], angle, EARTH.rotation_rate),
     )
     r_e, v_e = (ca.vertsplit(each) for each in turn(ca.vertcat(*r), ca.vertcat(*v), t))
     for name, values in (("r_e", r_e), ("v_e", v_e), ("delta_v_e", [ca.MX(0.0)] * 3)):

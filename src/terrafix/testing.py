@@ -126,6 +126,11 @@ def drive(
             f"a {type(component).__name__} has no rate of its own\n"
             '  give it one to be driven at: rate=Rate("0.01")'
         )
+    if not isinstance(inputs, Mapping | None):
+        raise ConfigurationError(
+            f"inputs is {inputs!r}; drive takes a dict by the names of the component's inputs:\n"
+            f"  {', '.join(component.inputs()) or 'it has none'}"
+        )
     system = System("drive")
     system.add(component, NAME)
     times = _times(component.rate, steps)
@@ -203,6 +208,8 @@ class _Source(Component):
 
     row: Callable[[int], dict[str, Any]]
     """Values by field, as the step of this number reads them."""
+    value: Any
+    """The port, which each kind of source declares."""
     ahead: int = 0
     """1 where the input is read at the start of the step: it shows the next step's value."""
 
@@ -215,7 +222,7 @@ class _Source(Component):
     def _publish(self) -> None:
         for name, value in self.row(self.step_index + self.ahead).items():
             if name:
-                setattr(self.value, name, value)  # type: ignore[attr-defined]
+                setattr(self.value, name, value)
             else:
                 self.value = value
 
@@ -224,6 +231,7 @@ class _MessageSource(Component):
     """Publishes given messages, each in the first step at or after its time."""
 
     coming: Sequence[tuple[float, dict[str, Any]]]
+    value: Any
 
     def _initialize_impl(self) -> None:
         self._publish(0.0)
@@ -238,7 +246,7 @@ class _MessageSource(Component):
                 n or "value": np.broadcast_to(v, (self.n_members, *np.shape(v)))
                 for n, v in fields.items()
             }
-            self.value.publish(valid_at, **given)  # type: ignore[attr-defined]
+            self.value.publish(valid_at, **given)
 
 
 def _source(
@@ -248,7 +256,7 @@ def _source(
     if port.kind == "message":
         kind = type("Messages", (_MessageSource,), {"value": _output(port)})
         made: Any = kind(rate=rate)
-        made.coming = _messages(name, port, values)
+        made.coming = _messages(name, port, values, seconds[-1])
         return made  # type: ignore[no-any-return]
     one = port.fields.get("")
     kind = type("Given", (_Source,), {"value": _output(port)})
@@ -283,9 +291,9 @@ def _rows(
     """What each step reads, checked before anything runs."""
     where = f"input '{name}'" + (f", field '{part}'" if part else "")
     if callable(values):
-        given = [np.asarray(values(t), dtype=field.dtype) for t in seconds]
+        given = [_array(where, field, values(t)) for t in seconds]
     else:
-        array = np.asarray(values, dtype=field.dtype)
+        array = _array(where, field, values)
         constant = _fits(array.shape, field.shape)
         if not constant and len(array) != len(seconds):
             raise ConfigurationError(
@@ -306,11 +314,33 @@ def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
     )
 
 
-def _messages(name: str, port: Port[Any], values: Any) -> list[tuple[float, dict[str, Any]]]:
+def _array(where: str, field: Field, value: Any) -> NDArray[Any]:
+    """The value as the port's dtype; text, None, ragged lists and what would be rounded are not."""
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise ConfigurationError(f"{where} takes shape {field.shape}, got uneven rows") from None
+    if not np.can_cast(array.dtype, field.dtype, "same_kind"):
+        raise ConfigurationError(
+            f"{where} takes {np.dtype(field.dtype)} in {field.unit_text()}, got {value!r}\n"
+            "  give plain numbers, a function of time or, for messages, a dict by time"
+        )
+    return array.astype(field.dtype)
+
+
+def _messages(
+    name: str, port: Port[Any], values: Any, end: float
+) -> list[tuple[float, dict[str, Any]]]:
     if not isinstance(values, Mapping):
         raise ConfigurationError(
             f"input '{name}' takes messages\n  give them by the time when they come: {{8.2: value}}"
         )
+    for t in values:
+        if not isinstance(t, int | float | np.number) or not 0.0 <= t <= end + 1e-9:
+            raise ConfigurationError(
+                f"a message to input '{name}' comes at {t!r}\n"
+                f"  the component is driven from 0 to {end:g} s: give a time in it, or more steps"
+            )
     found = []
     for t, value in sorted(values.items()):
         fields = value if port.is_bundle else {"": value}
@@ -319,10 +349,14 @@ def _messages(name: str, port: Port[Any], values: Any) -> list[tuple[float, dict
                 f"a message to input '{name}' has the fields {', '.join(port.fields)}\n"
                 "  give a dict with all of them"
             )
+        arrays = {}
         for part, each in fields.items():
-            expected = port.fields[part].shape
-            if not _fits(np.shape(each), expected):
-                where = f"input '{name}'" + (f", field '{part}'" if part else "")
-                raise ConfigurationError(f"{where} takes shape {expected}, got {np.shape(each)}")
-        found.append((float(t), dict(fields)))
+            where = f"input '{name}'" + (f", field '{part}'" if part else "")
+            field = port.fields[part]
+            arrays[part] = _array(where, field, each)
+            if not _fits(arrays[part].shape, field.shape):
+                raise ConfigurationError(
+                    f"{where} takes shape {field.shape}, got {arrays[part].shape}"
+                )
+        found.append((float(t), arrays))
     return found
