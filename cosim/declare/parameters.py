@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import conversion_factor, split_quantity
-from terrafix.cosim.declare.ports import Declaration
-from terrafix.cosim.memory.fields import Unit
+from terrafix.cosim.declare.ports import Declaration, written
+from terrafix.cosim.memory.fields import Unit, quoted
 
 Value = TypeVar("Value")
 REQUIRED: Any = object()
@@ -62,6 +62,9 @@ class Setting(Declaration, Generic[Value]):
         """Describe what is accepted, for listings."""
         return type(self).__name__.lower()
 
+    def _arguments(self) -> list[str]:
+        return [] if self.required or self.default in (None, {}) else [written(self.default)]
+
     def write(self, value: Value) -> Any:
         """Write a value so that `read` accepts it again (TOML types only)."""
         return value
@@ -73,7 +76,10 @@ class Setting(Declaration, Generic[Value]):
     def __get__(self, obj: object | None, owner: type) -> Self | Value:
         if obj is None:
             return self
-        return obj._settings[self.name]  # type: ignore[attr-defined, no-any-return]
+        try:
+            return obj._settings[self.name]  # type: ignore[attr-defined, no-any-return]
+        except KeyError:
+            raise self._absent(obj, f"has no value yet: it takes {self.kind()}") from None
 
     def __set__(self, obj: object, value: object) -> None:
         obj._set(self.name, value)  # type: ignore[attr-defined]
@@ -119,6 +125,16 @@ class Parameter(Setting[FloatArray]):
     def unit_text(self) -> str:
         """The unit as a person writes it."""
         return self.unit if isinstance(self.unit, str) else "(" + ", ".join(self.unit) + ")"
+
+    def _arguments(self) -> list[str]:
+        given = [] if self.required else [written(self.default)]
+        if self.shape:
+            given.append(f"shape={self.shape}")
+        if self.unit != "1":
+            given.append(f"unit={quoted(self.unit)}")
+        bounds = {"minimum": self.minimum, "maximum": self.maximum}
+        given += [f"{n}={v}" for n, v in bounds.items() if v is not None]
+        return given + [f"{n}=True" for n in ("positive", "infinite") if getattr(self, n)]
 
     def kind(self) -> str:
         """Describe what is accepted, for listings."""
@@ -275,6 +291,9 @@ class Choice(Setting[str]):
     def __init__(self, options: Sequence[str], default: Any = REQUIRED, *, doc: str = "") -> None:
         super().__init__(default, doc=doc)
         self.options = tuple(options)
+
+    def _arguments(self) -> list[str]:
+        return [quoted(self.options), *super()._arguments()]
 
     def kind(self) -> str:
         """Describe what is accepted, for listings."""

@@ -27,13 +27,16 @@ from numpy.typing import DTypeLike, NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.memory.fields import Field, Unit
+from terrafix.cosim.memory.fields import Field, Unit, quoted
 from terrafix.cosim.memory.messages import MessageReader, MessageWriter
 from terrafix.cosim.memory.slots import BundleView, WindowView
 
 When = Literal["start", "end"]
 Kind = Literal["signal", "message", "shared"]
 View = TypeVar("View")
+MOST_WRITTEN = 9  # numbers of an array
+LONGEST_WRITTEN = 60  # characters of a value
+MOST_FIELDS = 3  # of a bundle, in a repr
 
 
 class Declaration:
@@ -44,6 +47,28 @@ class Declaration:
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
+
+    def _arguments(self) -> list[str]:
+        """What its constructor was given, as it is written in Python; its meaning left out."""
+        return []
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(self._arguments())})"
+
+    def _absent(self, obj: object, what: str) -> AttributeError:
+        """What a person is told who reads a component outside a simulation."""
+        owner = getattr(obj, "name", "") or type(obj).__name__
+        return AttributeError(f"'{owner}.{self.name}' {what}", name=self.name, obj=obj)
+
+
+def written(value: object) -> str:
+    """Write a value as in Python, in one short line."""
+    if isinstance(value, str):
+        return quoted(value)
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist() if value.size <= MOST_WRITTEN else f"array {value.shape}"
+    text = str(value)
+    return text if len(text) <= LONGEST_WRITTEN else f"{text[: LONGEST_WRITTEN - 3]}..."
 
 
 class Port(Declaration, Generic[View]):
@@ -138,6 +163,27 @@ class Port(Declaration, Generic[View]):
         """The field of a port that is no bundle."""
         return self.fields[""]
 
+    def _arguments(self) -> list[str]:
+        given = self._bundled() if self.is_bundle else self.single.arguments()
+        if self.at != "end":
+            given.append(f"at={quoted(self.at)}")
+        if self.default is not None:
+            given.append(f"default={written(self.default)}")
+        elif self.optional:
+            given.append("optional=True")
+        if self.queue != 1:
+            given.append(f"queue={self.queue}")
+        if self.needed_at_start:
+            given.append("needed_at_start=True")
+        return given
+
+    def _bundled(self) -> list[str]:
+        listed = [f"{quoted(name)}: {field!r}" for name, field in self.fields.items()]
+        if len(listed) > MOST_FIELDS + 1:
+            listed[MOST_FIELDS:] = [f"... {len(listed) - MOST_FIELDS} more"]
+        keyword = "fields=" if self.kind == "message" else ""
+        return [f"{keyword}{{{', '.join(listed)}}}"]
+
     @overload
     def __get__(self, obj: None, owner: type) -> Self: ...
     @overload
@@ -145,7 +191,11 @@ class Port(Declaration, Generic[View]):
     def __get__(self, obj: object | None, owner: type) -> Self | View:
         if obj is None:
             return self
-        return obj._views[self.name]  # type: ignore[attr-defined, no-any-return]
+        try:
+            return obj._views[self.name]  # type: ignore[attr-defined, no-any-return]
+        except KeyError:
+            what = f'is a port: it has a value only in a simulation; ["{self.name}"] names it'
+            raise self._absent(obj, what) from None
 
     def __set__(self, obj: object, value: object) -> None:
         raise AttributeError(f"'{self.name}' is an input: components do not write their inputs")
@@ -228,9 +278,8 @@ class SharedInput(Port[Any]):
     is_input = True
 
     def __get__(self, obj: object | None, owner: type) -> Any:
-        if obj is None:
-            return self
-        return obj._views[self.name].value  # type: ignore[attr-defined]
+        view = super().__get__(obj, owner)
+        return view if obj is None else view.value
 
 
 class SharedOutput(Port[Any]):
@@ -239,9 +288,8 @@ class SharedOutput(Port[Any]):
     kind = "shared"
 
     def __get__(self, obj: object | None, owner: type) -> Any:
-        if obj is None:
-            return self
-        return obj._views[self.name].value  # type: ignore[attr-defined]
+        view = super().__get__(obj, owner)
+        return view if obj is None else view.value
 
     def __set__(self, obj: object, value: object) -> None:
         obj._views[self.name].put(value)  # type: ignore[attr-defined]
@@ -264,6 +312,10 @@ class State(Declaration):
         self.start = start
         self.doc = doc
 
+    def _arguments(self) -> list[str]:
+        start = [] if np.array_equal(self.start, 0) else [f"start={written(self.start)}"]
+        return [*self.field.arguments(), *start]
+
     @overload
     def __get__(self, obj: None, owner: type) -> Self: ...
     @overload
@@ -271,7 +323,10 @@ class State(Declaration):
     def __get__(self, obj: object | None, owner: type) -> Self | NDArray[Any]:
         if obj is None:
             return self
-        return obj._states[self.name]  # type: ignore[attr-defined, no-any-return]
+        try:
+            return obj._states[self.name]  # type: ignore[attr-defined, no-any-return]
+        except KeyError:
+            raise self._absent(obj, "is a state: it has a value only in a simulation") from None
 
     def __set__(self, obj: object, value: object) -> None:
         obj._states[self.name][...] = value  # type: ignore[attr-defined]

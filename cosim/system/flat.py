@@ -54,7 +54,7 @@ class FlatSystem:
                 f"there is no component '{owner}' in '{path}'\n"
                 f"  {nearest(owner, self.components, what='components')}"
             )
-        return self.components[owner][name].component.ports[name]  # type: ignore[no-any-return]
+        return self.components[owner][name].declared
 
     def owner(self, path: str) -> str:
         """Path of the component that a port belongs to."""

@@ -23,7 +23,7 @@ from terrafix.cosim.basics.errors import (
 )
 
 if TYPE_CHECKING:
-    from terrafix.cosim.engine.simulation import Result
+    from terrafix.cosim.engine.result import Result
     from terrafix.cosim.system.system import System
 
 FAILED, REFUSED = 1, 2
@@ -490,15 +490,11 @@ def _one_member(
 @_json
 def check(system: str, settings: Settings, as_json: bool) -> None:
     """Find every mistake in a system, and say what it consists of."""
-    from terrafix.cosim.system.check import check as check_system
-    from terrafix.cosim.system.display import plan_content, plan_tables
-
-    loaded = _read(system, settings)
-    plan = check_system(loaded, duration=loaded.duration)
+    plan = _read(system, settings).check()
     if as_json:
-        _print_json(plan_content(plan))
+        _print_json(plan.content())
     else:
-        _show(*plan_tables(plan))
+        _show(plan)
 
 
 @main.command()
@@ -507,16 +503,12 @@ def check(system: str, settings: Settings, as_json: bool) -> None:
 @click.option("-o", "out", metavar="FILE", help="Write .svg, .png or .mmd (Mermaid) there.")
 def graph(system: str, settings: Settings, out: str | None) -> None:
     """Draw a system; without -o, print it as Mermaid text."""
-    from terrafix.cosim.system.graph import draw, mermaid
-
     target = _target("-o", out, DIAGRAMS)
-    loaded = _read(system, settings)
+    diagram = _read(system, settings).graph()
     if target is None:
-        print(mermaid(loaded), end="")
-    elif target.suffix.lower() == ".mmd":
-        target.write_text(mermaid(loaded), encoding="utf-8")
+        print(diagram)
     else:
-        draw(loaded, target)
+        diagram.save(target)
 
 
 @main.command()
@@ -524,7 +516,7 @@ def graph(system: str, settings: Settings, out: str | None) -> None:
 @_json
 def components(kind: str | None, as_json: bool) -> None:
     """List component types, or the parameters and ports of one type."""
-    from terrafix.cosim.system import display as listing
+    from terrafix.cosim.declare import listing
 
     content = listing.types_content() if kind is None else listing.type_content(kind)
     if as_json:
