@@ -54,7 +54,7 @@ class PortRef:
 
     component: Owner
     port: str
-    declared: Port[Any]
+    declared: Port[object]
 
     def __str__(self) -> str:
         return f"{self.component.name or '(unnamed)'}.{self.port}"
@@ -178,7 +178,7 @@ class Component(Shown):
         cls._declared = declared
         cls.__doc__ = _Documentation(vars(cls).get("__doc__"))  # type: ignore[assignment]
 
-    def __init__(self, *, rate: Rate | None = None, **settings: Any) -> None:
+    def __init__(self, *, rate: Rate | None = None, **settings: object) -> None:
         self.name = ""
         self.rate = rate or self.default_rate
         if self.rate is not None and not isinstance(self.rate, Rate):
@@ -186,7 +186,7 @@ class Component(Shown):
                 f"the rate of a {type(self).__name__} is {self.rate!r}\n"
                 '  write Rate("0.01") for a period, or Rate(hz=100)'
             )
-        self.ports: dict[str, Port[Any]] = {}
+        self.ports: dict[str, Port[object]] = {}
         self._views: dict[str, Any] = {}
         self._states: dict[str, NDArray[Any]] = {}
         self._settings: dict[str, Any] = {}
@@ -215,7 +215,7 @@ class Component(Shown):
     # ------------------------------------------------------------------ settings and ports
 
     @classmethod
-    def settings(cls) -> dict[str, Setting[Any]]:
+    def settings(cls) -> dict[str, Setting[object]]:
         """Declared parameters by name."""
         return {n: d for n, d in cls._declared.items() if isinstance(d, Setting)}
 
@@ -264,11 +264,11 @@ class Component(Shown):
         title = type(self).__name__ + (f" '{self.name}'" if self.name else "")
         return component_shown(title, self.rate, self.settings(), self._base, self.ports)
 
-    def inputs(self) -> dict[str, Port[Any]]:
+    def inputs(self) -> dict[str, Port[object]]:
         """Input ports by name."""
         return {n: p for n, p in self.ports.items() if p.is_input}
 
-    def outputs(self) -> dict[str, Port[Any]]:
+    def outputs(self) -> dict[str, Port[object]]:
         """Output ports by name."""
         return {n: p for n, p in self.ports.items() if not p.is_input}
 

@@ -14,13 +14,13 @@ from terrafix.cosim.show.tables import Block, Table, first, named
 
 MOST_ROWS = 10
 MOST_FIELDS = 5  # of a bundle, by name
-Settings = Mapping[str, Setting[Any]]
-Ports = Mapping[str, Port[Any]]
+Settings = Mapping[str, Setting[object]]
+Ports = Mapping[str, Port[object]]
 
 # ---------------------------------------------------------------------- as plain data
 
 
-def setting_content(name: str, setting: Setting[Any]) -> dict[str, Any]:
+def setting_content(name: str, setting: Setting[object]) -> dict[str, Any]:
     """Describe a parameter in plain types."""
     default = None
     if not setting.required:
@@ -34,7 +34,7 @@ def setting_content(name: str, setting: Setting[Any]) -> dict[str, Any]:
     }
 
 
-def port_content(name: str, port: Port[Any]) -> dict[str, Any]:
+def port_content(name: str, port: Port[object]) -> dict[str, Any]:
     """Describe a port in plain types."""
     fields = [
         {
@@ -144,7 +144,7 @@ def _and_more(count: int) -> list[Block]:
     return [Text(f"and {count} more", style="dim")] if count else []
 
 
-def _value(name: str, setting: Setting[Any], values: Mapping[str, Any]) -> str:
+def _value(name: str, setting: Setting[object], values: Mapping[str, Any]) -> str:
     if name not in values:
         return "missing"
     value = values[name]

@@ -23,7 +23,7 @@ from dataclasses import field as dataclass_field
 from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -33,7 +33,9 @@ from terrafix.cosim.memory.slots import BundleView, WindowView
 
 When = Literal["start", "end"]
 Kind = Literal["signal", "message", "shared"]
-View = TypeVar("View")
+Default = ArrayLike | Mapping[str, ArrayLike]
+"""What an unconnected input reads: of a bundle by field."""
+View_co = TypeVar("View_co", covariant=True)
 MOST_WRITTEN = 9  # numbers of an array
 LONGEST_WRITTEN = 60  # characters of a value
 MOST_FIELDS = 3  # of a bundle, in a repr
@@ -71,8 +73,8 @@ def written(value: object) -> str:
     return text if len(text) <= LONGEST_WRITTEN else f"{text[: LONGEST_WRITTEN - 3]}..."
 
 
-class Port(Declaration, Generic[View]):
-    """Base of all ports. Reading one on a component gives its `View`, once bound.
+class Port(Declaration, Generic[View_co]):
+    """Base of all ports. Reading one on a component gives its `View_co`, once bound.
 
     Attributes
     ----------
@@ -107,7 +109,7 @@ class Port(Declaration, Generic[View]):
         fields: Mapping[str, Field] | None = None,
         doc: str = "",
         at: When = "end",
-        default: Any = None,
+        default: Default | None = None,
         queue: int = 1,
         window: bool = False,
         optional: bool = False,
@@ -187,8 +189,8 @@ class Port(Declaration, Generic[View]):
     @overload
     def __get__(self, obj: None, owner: type) -> Self: ...
     @overload
-    def __get__(self, obj: object, owner: type) -> View: ...
-    def __get__(self, obj: object | None, owner: type) -> Self | View:
+    def __get__(self, obj: object, owner: type) -> View_co: ...
+    def __get__(self, obj: object | None, owner: type) -> Self | View_co:
         if obj is None:
             return self
         try:
@@ -232,8 +234,16 @@ class BundleInput(Port[BundleView]):
 
     is_input = True
 
-    def __init__(self, fields: Mapping[str, Field], **options: Any) -> None:
-        super().__init__(fields=fields, **options)
+    def __init__(
+        self,
+        fields: Mapping[str, Field],
+        *,
+        at: When = "end",
+        default: Default | None = None,
+        optional: bool = False,
+        doc: str = "",
+    ) -> None:
+        super().__init__(fields=fields, at=at, default=default, optional=optional, doc=doc)
 
 
 class BundleOutput(Port[BundleView]):
@@ -267,29 +277,57 @@ class WindowInput(Port[WindowView]):
 
     is_input = True
 
-    def __init__(self, shape: Sequence[int | None] = (), **options: Any) -> None:
-        super().__init__(shape, window=True, **options)
+    def __init__(
+        self,
+        shape: Sequence[int | None] = (),
+        *,
+        unit: Unit = "1",
+        frame: str | None = None,
+        dtype: DTypeLike = np.float64,
+        labels: Sequence[str] = (),
+        at: When = "end",
+        default: Default | None = None,
+        optional: bool = False,
+        doc: str = "",
+    ) -> None:
+        super().__init__(
+            shape,
+            unit=unit,
+            frame=frame,
+            dtype=dtype,
+            labels=labels,
+            at=at,
+            default=default,
+            optional=optional,
+            window=True,
+            doc=doc,
+        )
 
 
-class SharedInput(Port[Any]):
+class _Shared(Port[NDArray[Any]]):
+    """One value for all members, passed by reference."""
+
+    kind = "shared"
+
+    @overload
+    def __get__(self, obj: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, obj: object, owner: type) -> NDArray[Any]: ...
+    def __get__(self, obj: object | None, owner: type) -> Self | NDArray[Any]:
+        if obj is None:
+            return self
+        slot: Any = super().__get__(obj, owner)
+        return slot.value  # type: ignore[no-any-return]
+
+
+class SharedInput(_Shared):
     """One value for all members, read by reference."""
 
-    kind = "shared"
     is_input = True
 
-    def __get__(self, obj: object | None, owner: type) -> Any:
-        view = super().__get__(obj, owner)
-        return view if obj is None else view.value
 
-
-class SharedOutput(Port[Any]):
+class SharedOutput(_Shared):
     """One value for all members; assigning publishes the array itself, without a copy."""
-
-    kind = "shared"
-
-    def __get__(self, obj: object | None, owner: type) -> Any:
-        view = super().__get__(obj, owner)
-        return view if obj is None else view.value
 
     def __set__(self, obj: object, value: object) -> None:
         obj._views[self.name].put(value)  # type: ignore[attr-defined]
@@ -305,7 +343,7 @@ class State(Declaration):
         unit: Unit = "1",
         frame: str | None = None,
         dtype: DTypeLike = np.float64,
-        start: Any = 0,
+        start: ArrayLike = 0,
         doc: str = "",
     ) -> None:
         self.field = Field(tuple(shape), unit, frame, dtype, doc=doc)

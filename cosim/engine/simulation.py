@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from terrafix.cosim.declare.evaluation import Evaluation
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import State
 from terrafix.cosim.engine.master import Master
-from terrafix.cosim.engine.result import Result
+from terrafix.cosim.engine.result import Exclusion, Result
 from terrafix.cosim.kernels.build import build_kernels
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.slots import SignalSlot
@@ -304,7 +304,7 @@ class Simulation:
             system=self.system.name,
             seed=self.seed,
             members=len(self.members),
-            excluded=list(self.master.excluded),
+            excluded=cast("list[Exclusion]", list(self.master.excluded)),
             ticks=self.master.tick,
             component_steps=self.master.component_steps,
             wall_s=wall_s,

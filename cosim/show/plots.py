@@ -109,7 +109,8 @@ def result_figure(dataset: xarray.Dataset) -> Figure:
     """
     with own_style():
         drawn = figure(dataset)
-    drawn._repr_png_ = partial(_png, drawn)  # a figure without pyplot does not show itself
+    # of its own, a figure shows itself only beside pyplot
+    drawn._repr_png_ = partial(_png, drawn)  # type: ignore[attr-defined]
     return drawn
 
 
@@ -189,7 +190,7 @@ def _element_names(variable: xarray.DataArray) -> list[str]:
 
 def _evaluation_figure(
     dataset: xarray.Dataset, found: Mapping[str, Mapping[str, list[Panel]]]
-) -> Any:
+) -> Figure:
     from matplotlib.figure import Figure
 
     columns = max(len(quantities) for quantities in found.values())
@@ -350,7 +351,7 @@ def _messages(dataset: xarray.Dataset) -> set[str]:
     return {s for s in stamps if any(n == s or n.startswith(f"{s}.") for n in values)}
 
 
-def _signal_figure(dataset: xarray.Dataset, names: list[str]) -> Any:
+def _signal_figure(dataset: xarray.Dataset, names: list[str]) -> Figure:
     from matplotlib.figure import Figure
 
     columns = 1 if len(names) < 4 else 2

@@ -14,7 +14,7 @@ import re
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Self, TypeAlias, TypeVar, overload
 
 from terrafix.cosim.basics.clock import Exact, Rate, seconds
 from terrafix.cosim.basics.errors import (
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 TABLES = frozenset({"component", "wiring", "expose", "record", "dispersion", "choice"})
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 Node = TypeVar("Node", bound="Component | System")
+End: TypeAlias = "PortRef | Component | System | str"
+"""A port or its path; what ``system[...]`` gives is taken, and refused where it is no port."""
 
 
 class Nodes(dict[str, "Component | System"]):
@@ -165,14 +167,14 @@ class System(Shown):
         inner = [f"{name}.{port}" for name, own in ports.items() for port in own]
         return [*self.nodes, *self.exposed, *inner]
 
-    def expose(self, name: str, port: PortRef | str) -> None:
+    def expose(self, name: str, port: End) -> None:
         """Make a port of a component a port of this system."""
         _checked_name(name, "port")
         path = self._path(port)
         self.resolve(path)
         self.exposed[name] = path
 
-    def connect(self, source: PortRef | str, target: PortRef | str, *, delay: Exact = 0) -> None:
+    def connect(self, source: End, target: End, *, delay: Exact = 0) -> None:
         """Connect an output to an input, optionally with a delay [s].
 
         Raises
@@ -218,7 +220,7 @@ class System(Shown):
     def record(
         self,
         name: str,
-        ports: PortRef | str | Sequence[PortRef | str],
+        ports: End | Sequence[End],
         *,
         period: Exact | None = None,
         rate: Rate | None = None,
@@ -229,7 +231,7 @@ class System(Shown):
             raise ConfigurationError(f"system '{self.name}' has a record '{name}' already")
         if period is not None:
             rate = Rate(period)
-        listed = [ports] if isinstance(ports, PortRef | str) else ports
+        listed = [ports] if isinstance(ports, PortRef | Component | System | str) else ports
         paths = tuple(self._path(p) for p in listed)
         if not paths:
             raise ConfigurationError(f"record '{name}' names no ports")
@@ -307,7 +309,7 @@ class System(Shown):
             raise
         return node
 
-    def _path(self, port: PortRef | str) -> str:
+    def _path(self, port: End) -> str:
         if isinstance(port, str):
             return port
         if not isinstance(port, PortRef):
@@ -321,7 +323,7 @@ class System(Shown):
 
     # ------------------------------------------------------------------ reading
 
-    def resolve(self, path: str) -> tuple[str, Port[Any]]:
+    def resolve(self, path: str) -> tuple[str, Port[object]]:
         """Follow exposed ports down to (path of the component's port, port).
 
         Raises
