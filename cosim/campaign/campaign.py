@@ -198,14 +198,9 @@ def _described(source: FileSource | System) -> dict[str, Any]:
 
 def _drawn(system: System) -> str:
     """The system's diagram as SVG."""
-    from tempfile import TemporaryDirectory
+    from terrafix.cosim.system.graph import Diagram
 
-    from terrafix.cosim.system.graph import draw
-
-    with TemporaryDirectory(prefix="terrafix-") as folder:
-        file = Path(folder, "graph.svg")
-        draw(system, file)
-        text = file.read_text()
+    text = Diagram(system).svg()
     return text[text.index("<svg") :]
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +22,14 @@ from terrafix.cosim.basics.units import check_unit, conversion_factor
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.memory.fields import Field
+from terrafix.cosim.show.tables import Block, Shown
 from terrafix.cosim.system.dispersion import overridden
 from terrafix.cosim.system.flat import FlatSystem, Flattened, Record
 from terrafix.cosim.system.order import stepping_order
 
 
-@dataclass(frozen=True)
-class Plan:
+@dataclass(frozen=True, repr=False)
+class Plan(Shown):
     """A checked system: what the master runs.
 
     Attributes
@@ -49,6 +51,17 @@ class Plan:
     base: Fraction
     grid: Fraction
     notes: list[str]
+
+    def content(self) -> dict[str, Any]:
+        """Plain types for JSON, components in stepping order."""
+        from terrafix.cosim.system.display import plan_content
+
+        return plan_content(self.flat, self.order, self.base, self.notes)
+
+    def _shown(self) -> list[Block]:
+        from terrafix.cosim.system.display import plan_shown
+
+        return plan_shown(self.content())
 
 
 def check(system: Flattened, *, duration: Fraction | None = None, outside: bool = False) -> Plan:

@@ -17,6 +17,7 @@ import numpy as np
 
 from terrafix.cosim.basics.clock import Rate, base_step
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import docstring
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.exchange.fmi.write.variables import PortVariables, Variable
@@ -179,7 +180,7 @@ class Source:
         assert rate is not None
         tick = base or base_step(rate.exact_numbers, rate.times or ())
         outside = {f"{path}.{name}": name for name in component.ports}
-        doc = (type(component).__doc__ or "").strip().splitlines()[0]
+        doc = docstring(type(component)).partition("\n")[0]
         return cls(
             path.replace(".", "_"),
             doc,
