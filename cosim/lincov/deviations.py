@@ -477,7 +477,7 @@ class _Analysis:
     def _advance(self, end: int) -> None:
         """Fly to the next tick; or a stretch of ticks, noting those whose Jacobians serve all."""
         master = self.simulation.master
-        pending = [(g.next_tick, g) for g in master._groups if g.next_tick is not None]
+        pending = [(g.next_tick, g) for g in master.agenda.groups if g.next_tick is not None]
         first = min(tick for tick, _ in pending)
         if first > end:
             self._run(end, listening=False)
@@ -499,8 +499,8 @@ class _Analysis:
     def _regular(self, group: Any) -> bool:
         """Whether the components that step with a group publish signals alone."""
         master = self.simulation.master
-        number = master._groups.index(group)
-        mine = [p for p, n in master._group_of.items() if n == number]
+        number = master.agenda.groups.index(group)
+        mine = [p for p, n in master.group_of.items() if n == number]
         return bool(mine) and all(
             p in self.linear and not self.linear[p].component._messages for p in mine
         )
@@ -510,7 +510,7 @@ class _Analysis:
         master = self.simulation.master
         for linear in self.linear.values():
             linear.component._call = linear.listening if listening else linear.listening.kernel
-        master._programs = self._programs[listening]
+        master.programs = self._programs[listening]
         master.run_until(tick)
 
     def _note(self, tick: int, repeat: int) -> None:
@@ -808,7 +808,7 @@ def _directions(system: System, length: Any, result: LinearCovariance) -> list[D
         for name, port in flat.components[corrector].inputs().items():
             if port.kind == "message":
                 reader = flat.components[corrector]._views[name]
-                waiting = deaf.master._entries[corrector]
+                waiting = deaf.master.entries[corrector]
                 waiting.before = tuple(
                     t for t in waiting.before if getattr(t, "__self__", None) is not reader
                 )

@@ -14,7 +14,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafix.cosim.basics.clock import Rate, base_step
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -25,7 +24,6 @@ from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.system.flat import Connection
 from terrafix.cosim.system.wiring import port_factor
 
-BoolArray = NDArray[np.bool_]
 TIME = 0
 MOST_TEXT = 400  # of a component's path and a stream's name, in the hash of core.c
 
