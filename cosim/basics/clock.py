@@ -255,6 +255,12 @@ class Rate:
         ticks_per_point = int(grid / base)
         return [math.ceil(time / grid) * ticks_per_point for time in self.times]
 
+    def identity(self) -> str:
+        """All of it, as `str` but with every listed time: equal for equal rates alone."""
+        if self.times is None:
+            return str(self)
+        return f"at {', '.join(map(text_seconds, self.times))} s"
+
     def __str__(self) -> str:
         if self.times is not None:
             shown = ", ".join(text_seconds(t) for t in self.times[:4])
