@@ -114,17 +114,20 @@ class SymbolicComponent(Component):
         return self._model[1]
 
     _model: tuple[Any, SymbolicModel] | None = None
-    _kept: tuple[Any, Kernel] | None = None
+    _kept: tuple[SymbolicModel, Any, Kernel] | None = None
 
     @property
     def kept_kernel(self) -> Kernel | None:
         """The kernel of an earlier simulation of this component, if it would be made alike now."""
-        now = (id(self.model), self.environment.quiet, _asked_for())
-        return self._kept[1] if self._kept is not None and self._kept[0] == now else None
+        if self._kept is None:
+            return None
+        model, made, kernel = self._kept
+        alike = model is self.model and made == (self.environment.quiet, _asked_for())
+        return kernel if alike else None
 
     def keep_kernel(self, kernel: Kernel) -> None:
         """Keep a kernel for later simulations."""
-        self._kept = ((id(self.model), self.environment.quiet, _asked_for()), kernel)
+        self._kept = self.model, (self.environment.quiet, _asked_for()), kernel
 
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: neither models nor kernels, which are made there."""
@@ -346,6 +349,6 @@ def _each_member(
         return [np.empty((0, function.numel_out(i))) for i in range(function.n_out())]
     whole = function.map(n_members)
     columns = [np.asfortranarray(r.T) for r in rows]
-    results = whole(*columns, *(np.full((1, n_members), value) for value in clock))
-    results = results if isinstance(results, tuple | list) else (results,)
-    return [np.asarray(r, dtype=np.float64).T for r in results]
+    arguments = [*columns, *(np.full((1, n_members), value) for value in clock)]
+    results = whole.call(arguments)  # a list, also of a function without arguments
+    return [np.asarray(r.full(), dtype=np.float64).T for r in results]

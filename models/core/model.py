@@ -298,8 +298,7 @@ class Model:
             value = np.asarray(values.get(name, 0.0), dtype=np.float64)
             size = function.numel_in(i)
             arguments.append(np.full(size, value) if value.ndim == 0 else value.reshape(size))
-        result = function(*arguments)
-        return list(result) if isinstance(result, tuple) else [result]
+        return list(function.call(arguments))  # a list, also where there are no arguments
 
     def jacobian_expression(self, output: str, wrt: str) -> Any:
         """Symbolic derivative of an output by a declared quantity, both in row-major order."""

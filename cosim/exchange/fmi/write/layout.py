@@ -179,7 +179,7 @@ class Source:
         assert rate is not None
         tick = base or base_step(rate.exact_numbers, rate.times or ())
         outside = {f"{path}.{name}": name for name in component.ports}
-        doc = (type(component).__doc__ or "").strip().splitlines()[0]
+        doc = (type(component).__doc__ or "").strip().partition("\n")[0]
         return cls(
             path.replace(".", "_"),
             doc,
@@ -684,8 +684,7 @@ def _forward(call: Call, name: str, by: Sequence[int], n_outputs: int) -> Call:
 
     function = call.function
     symbols = [ca.SX.sym(f"x{i}", function.numel_in(i)) for i in range(function.n_in())]
-    results = function(*symbols)
-    results = list(results) if isinstance(results, tuple | list) else [results]
+    results = function.call(symbols)
     results = results[:n_outputs]
     seeds = [ca.SX.sym(f"d{i}", function.numel_in(i)) for i in by]
     if seeds and results:
