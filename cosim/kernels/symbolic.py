@@ -73,6 +73,9 @@ class SymbolicModel(Protocol):
     def shape(self, name: str) -> tuple[int, ...]:
         """Shape of a named quantity."""
 
+    def uses(self, parameter: str) -> bool:
+        """Whether any expression depends on a parameter."""
+
     @property
     def derivatives(self) -> Symbols:
         """Derivatives of continuous states by name."""
@@ -133,6 +136,10 @@ class SymbolicComponent(Component):
         """What goes to another process: neither models nor kernels, which are made there."""
         left = {"_model", "_kept", "kernel", "_call"}
         return {k: v for k, v in self.__dict__.items() if k not in left}
+
+    def takes(self, name: str) -> bool:
+        """Whether a parameter has any effect, as the choices are now."""
+        return not isinstance(self.settings()[name], Parameter) or self.model.uses(name)
 
     def validate(self) -> None:
         """Check that every name of the model is a port or parameter of this component."""

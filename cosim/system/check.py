@@ -291,6 +291,9 @@ def _notes(flat: FlatSystem) -> Iterator[str]:
                     f"{source}: between its steps the last value is held"
                 )
     for path, component in flat.components.items():
+        for name in component.settings():
+            if not component.is_default(name) and (reason := component.idle(name)):
+                yield reason
         for note in component.capabilities.notes:
             yield f"'{path}': {note}"
     for connection in flat.connections:

@@ -152,6 +152,21 @@ class Model:
             clock,
         ]
 
+    def uses(self, parameter: str) -> bool:
+        """Whether any expression depends on a parameter; false if the model has none of that name.
+
+        A choice (two-body gravity, say) may leave a parameter (J2) without any effect.
+        """
+        if parameter not in self.parameters:
+            return False
+        symbol = ca.vec(self.parameters[parameter])
+        expressions = [
+            ca.vec(ca.densify(ca.SX(e)))
+            for kind in (self.outputs, self.next, self.derivatives, self.initial)
+            for e in kind.values()
+        ]
+        return bool(expressions) and bool(ca.depends_on(ca.vertcat(*expressions), symbol))
+
     def shape(self, name: str) -> tuple[int, ...]:
         """Shape of a named quantity as NumPy sees it: ``(n,)`` for a column, else ``(n, m)``."""
         for group in (*self._symbol_groups(), dict(self.outputs)):
