@@ -269,6 +269,12 @@ class Rate:
         cut = ", ".join([*listed[: MOST_TIMES // 2], "...", listed[-1]])
         return f"Rate(times=[{cut}])  # {len(listed)} times"
 
+    def identity(self) -> str:
+        """All of it, as `str` but with every listed time: equal for equal rates alone."""
+        if self.times is None:
+            return str(self)
+        return f"at {', '.join(map(text_seconds, self.times))} s"
+
     def __str__(self) -> str:
         if self.times is not None:
             shown = ", ".join(text_seconds(t) for t in self.times[:4])

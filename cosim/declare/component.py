@@ -26,7 +26,7 @@ from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, RateError, WiringError, nearest
 from terrafix.cosim.basics.noise import NormalBlocks, NormalStream
-from terrafix.cosim.declare.parameters import Parameter, Setting
+from terrafix.cosim.declare.parameters import Choice, Flag, Parameter, Setting, shown
 from terrafix.cosim.declare.ports import Capabilities, Declaration, Port, State
 from terrafix.cosim.show.tables import Block, Shown
 
@@ -234,6 +234,30 @@ class Component(Shown):
     def setting(self, name: str) -> Any:
         """The value that was set (for numeric parameters: before dispersions, without members)."""
         return self._base[name]
+
+    def is_default(self, name: str) -> bool:
+        """Whether a parameter stands as its declaration has it."""
+        declared = self.settings()[name]
+        if declared.required or name not in self._base:
+            return name not in self._base
+        default = declared.read(declared.default, where=f"default of '{name}'")
+        return bool(np.all(np.asarray(self._base[name] == default)))
+
+    def takes(self, name: str) -> bool:
+        """Whether a parameter has any effect, as the others are now; override where it may not."""
+        return name in self.settings()
+
+    def idle(self, name: str) -> str | None:
+        """Why a parameter would change nothing, in words; None if it has an effect."""
+        if self.missing_settings() or self.takes(name):
+            return None
+        chosen = [
+            f"{n} = {shown(self.setting(n))}"
+            for n, s in self.settings().items()
+            if isinstance(s, Choice | Flag)
+        ]
+        with_these = f" with {', '.join(chosen)}" if chosen else ""
+        return f"'{self.name}' does not take '{name}'{with_these}: it would change nothing"
 
     def missing_settings(self) -> list[str]:
         """Names of required parameters that were not given."""

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
-from terrafix.cosim.basics.units import conversion_factor, split_quantity
+from terrafix.cosim.basics.units import conversion_factor, difference, split_quantity
 from terrafix.cosim.declare.ports import Declaration, written
 from terrafix.cosim.memory.fields import Unit, quoted
 
@@ -203,7 +203,7 @@ class Parameter(Setting[FloatArray]):
         if factor is None:
             raise ConfigurationError(
                 f"{where} is given in {unit}; it takes {self.kind()}\n"
-                f"  the units differ: {unit} is not {self.unit}"
+                f"  {difference(unit, self.unit)}"
             )
         with np.errstate(over="ignore"):  # infinity is refused below
             return array * factor

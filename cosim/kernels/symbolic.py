@@ -72,6 +72,9 @@ class SymbolicModel(Protocol):
     def shape(self, name: str) -> tuple[int, ...]:
         """Shape of a named quantity."""
 
+    def uses(self, parameter: str) -> bool:
+        """Whether any expression depends on a parameter."""
+
     @property
     def derivatives(self) -> Symbols:
         """Derivatives of continuous states by name."""
@@ -113,22 +116,29 @@ class SymbolicComponent(Component):
         return self._model[1]
 
     _model: tuple[Any, SymbolicModel] | None = None
-    _kept: tuple[Any, Kernel] | None = None
+    _kept: tuple[SymbolicModel, Any, Kernel] | None = None
 
     @property
     def kept_kernel(self) -> Kernel | None:
         """The kernel of an earlier simulation of this component, if it would be made alike now."""
-        now = (id(self.model), self.environment.quiet, _asked_for())
-        return self._kept[1] if self._kept is not None and self._kept[0] == now else None
+        if self._kept is None:
+            return None
+        model, made, kernel = self._kept
+        alike = model is self.model and made == (self.environment.quiet, _asked_for())
+        return kernel if alike else None
 
     def keep_kernel(self, kernel: Kernel) -> None:
         """Keep a kernel for later simulations."""
-        self._kept = ((id(self.model), self.environment.quiet, _asked_for()), kernel)
+        self._kept = self.model, (self.environment.quiet, _asked_for()), kernel
 
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: neither models nor kernels, which are made there."""
         left = {"_model", "_kept", "kernel", "call"}
         return {k: v for k, v in self.__dict__.items() if k not in left}
+
+    def takes(self, name: str) -> bool:
+        """Whether a parameter has any effect, as the choices are now."""
+        return not isinstance(self.settings()[name], Parameter) or self.model.uses(name)
 
     def validate(self) -> None:
         """Check that every name of the model is a port or parameter of this component."""
@@ -345,6 +355,6 @@ def _each_member(
         return [np.empty((0, function.numel_out(i))) for i in range(function.n_out())]
     whole = function.map(n_members)
     columns = [np.asfortranarray(r.T) for r in rows]
-    results = whole(*columns, *(np.full((1, n_members), value) for value in clock))
-    results = results if isinstance(results, tuple | list) else (results,)
-    return [np.asarray(r, dtype=np.float64).T for r in results]
+    arguments = [*columns, *(np.full((1, n_members), value) for value in clock)]
+    results = whole.call(arguments)  # a list, also of a function without arguments
+    return [np.asarray(r.full(), dtype=np.float64).T for r in results]

@@ -272,13 +272,13 @@ def record_rate(flat: FlatSystem, record: Record) -> Rate:
         owners.append(flat.owner(path))
     if record.rate is not None:
         return record.rate
-    rates = {str(flat.components[o].rate): flat.components[o].rate for o in owners}
+    rates = {flat.components[o].rate for o in owners}
     if len(rates) > 1:
         raise RateError(
             f"record '{record.name}' watches components of different rates "
-            f"({', '.join(sorted(rates))})\n  give it a period of its own"
+            f"({', '.join(sorted(map(str, rates)))})\n  give it a period of its own"
         )
-    rate = next(iter(rates.values()))
+    (rate,) = rates
     if rate is None:
         raise RateError(f"record '{record.name}' watches a component without a rate")
     return rate
@@ -304,6 +304,9 @@ def _notes(flat: FlatSystem) -> Iterator[str]:
                     f"{source}: between its steps the last value is held"
                 )
     for path, component in flat.components.items():
+        for name in component.settings():
+            if not component.is_default(name) and (reason := component.idle(name)):
+                yield reason
         for note in component.capabilities.notes:
             yield f"'{path}': {note}"
     for connection in flat.connections:

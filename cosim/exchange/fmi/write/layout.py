@@ -685,8 +685,7 @@ def _forward(call: Call, name: str, by: Sequence[int], n_outputs: int) -> Call:
 
     function = call.function
     symbols = [ca.SX.sym(f"x{i}", function.numel_in(i)) for i in range(function.n_in())]
-    results = function(*symbols)
-    results = list(results) if isinstance(results, tuple | list) else [results]
+    results = function.call(symbols)
     results = results[:n_outputs]
     seeds = [ca.SX.sym(f"d{i}", function.numel_in(i)) for i in by]
     if seeds and results:
