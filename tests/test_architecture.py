@@ -115,6 +115,45 @@ def test_imports_within_folders_have_no_circles():
     list(TopologicalSorter(graph).static_order())  # raises CycleError, which names the circle
 
 
+FOREIGN = {
+    "os._exit": "the system's own name for leaving without clean-up",
+    "drawn._repr_png_": "Jupyter's own name, given to a figure of matplotlib",
+}
+"""Underscore names of others that are used, and why."""
+
+
+def touched(path: Path) -> set[str]:
+    """Underscore names that a module uses though it did not define them."""
+    tree = ast.parse(path.read_text())
+    own, used = set(), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            own.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            own.add(node.id)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("terrafix"):
+            used |= {f"{node.module}.{a.name}" for a in node.names if a.name.startswith("_")}
+        elif isinstance(node, ast.Attribute) and node.attr.startswith("_"):
+            if ast.unparse(node.value) in ("self", "cls", "super()"):
+                own.add(node.attr)
+            elif not node.attr.startswith("__"):
+                used.add(ast.unparse(node))
+    return {name for name in used if name.rpartition(".")[2] not in own}
+
+
+@pytest.mark.parametrize("module", NAMED)
+def test_no_module_touches_anothers_underscore_names(module):
+    assert touched(NAMED[module]) <= set(FOREIGN)
+
+
+def test_the_walk_sees_underscore_names(tmp_path):
+    """And every exception is needed."""
+    file = tmp_path / "module.py"
+    file.write_text("class A:\n  def f(self, b):\n    self._x = b._y\n    return b._x\n")
+    assert touched(file) == {"b._y"}
+    assert {name for path in NAMED.values() for name in touched(path)} == set(FOREIGN)
+
+
 def test_the_walk_sees_imports():
     """The tests above could fail: what is imported is found, inside functions too."""
     assert "cosim.records.results" in reached(NAMED["components.truth.playback"])

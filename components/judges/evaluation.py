@@ -70,8 +70,8 @@ class NavigationEvaluation(Evaluation):
         sigma = np.sqrt(np.where(variance > 0.0, variance, np.nan))
         for i, quantity in enumerate(self.quantities):
             part = slice(3 * i, 3 * i + 3)
-            self._views[f"{quantity.name}_error"][...] = error[:, part]
-            self._views[f"{quantity.name}_sigma"][...] = sigma[:, part]
+            self.port_views[f"{quantity.name}_error"][...] = error[:, part]
+            self.port_views[f"{quantity.name}_sigma"][...] = sigma[:, part]
         self.nees = normalized_square(error, estimate.P)
         self.covariance = estimate.P
         fresh = self.innovation.fresh

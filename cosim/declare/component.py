@@ -78,7 +78,7 @@ class _Documentation:
         from terrafix.cosim.declare.display import help_text
 
         doc = next(filter(None, (docstring(k) for k in owner.__mro__ if k is not Component)), "")
-        ports = {n: d for n, d in owner._declared.items() if isinstance(d, Port)}
+        ports = {n: d for n, d in owner.declarations.items() if isinstance(d, Port)}
         return help_text(doc, owner.default_rate, owner.settings(), ports)
 
 
@@ -151,6 +151,19 @@ class Component(Shown):
     **settings
         Declared parameters by name.
 
+    Attributes
+    ----------
+    declarations : dict of str to Declaration
+        Of the class: ports, states and parameters.
+    ports : dict of str to Port
+    given_parameters : dict
+        Parameters as they were set: before dispersions, without members. None stands for one that
+        was refused, and reported.
+    parameter_values : dict
+        Parameters as they are now: while a simulation runs, numeric ones have a row per member.
+    state_arrays, port_views : dict
+        What `bind` lends: arrays of states, and what stands behind each port.
+
     Raises
     ------
     ConfigurationError
@@ -159,7 +172,7 @@ class Component(Shown):
 
     capabilities: ClassVar[Capabilities] = Capabilities()
     default_rate: ClassVar[Rate | None] = None
-    _declared: ClassVar[dict[str, Declaration]] = {}
+    declarations: ClassVar[dict[str, Declaration]] = {}
     __signature__ = _CallTip()
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -177,7 +190,7 @@ class Component(Shown):
         clash |= {n for n in declared for base in cls.__mro__ if n in vars(base) and _own(base)}
         if clash:
             raise TypeError(f"{cls.__name__} declares reserved names {sorted(clash)}")
-        cls._declared = declared
+        cls.declarations = declared
         cls.__doc__ = _Documentation(vars(cls).get("__doc__"))  # type: ignore[assignment]
 
     def __init__(self, *, rate: Rate | None = None, **settings: object) -> None:
@@ -189,15 +202,15 @@ class Component(Shown):
                 '  write Rate("0.01") for a period, or Rate(hz=100)'
             )
         self.ports: dict[str, Port[object]] = {}
-        self._views: dict[str, Any] = {}
-        self._states: dict[str, NDArray[Any]] = {}
-        self._settings: dict[str, Any] = {}
-        self._base: dict[str, Any] = {}
+        self.port_views: dict[str, Any] = {}
+        self.state_arrays: dict[str, NDArray[Any]] = {}
+        self.parameter_values: dict[str, Any] = {}
+        self.given_parameters: dict[str, Any] = {}
         self._environment: Environment | None = None
         self._streams: dict[tuple[str, int], NormalBlocks] = {}
         self.step_index = 0
         declared = self.settings()
-        for name, value in self._declared.items():
+        for name, value in self.declarations.items():
             if isinstance(value, Port):
                 self.ports[name] = value
         for name in settings:
@@ -208,9 +221,9 @@ class Component(Shown):
                 )
         for name, setting in declared.items():
             if name in settings:
-                self._set(name, settings[name])
+                self.set_parameter(name, settings[name])
             elif not setting.required:
-                self._settings[name] = self._base[name] = setting.read(
+                self.parameter_values[name] = self.given_parameters[name] = setting.read(
                     setting.default, where=f"default of '{name}'"
                 )
 
@@ -219,29 +232,30 @@ class Component(Shown):
     @classmethod
     def settings(cls) -> dict[str, Setting[object]]:
         """Declared parameters by name."""
-        return {n: d for n, d in cls._declared.items() if isinstance(d, Setting)}
+        return {n: d for n, d in cls.declarations.items() if isinstance(d, Setting)}
 
-    def _set(self, name: str, value: object, *, bare: bool = True) -> None:
+    def set_parameter(self, name: str, value: object, *, bare: bool = True) -> None:
+        """Set a parameter by name, as assigning it does; `bare` allows numbers without a unit."""
         if self._environment is not None:
             raise ConfigurationError(
                 f"'{self.name}.{name}' cannot be set while a simulation runs; set it before"
             )
         where = f"'{self.name}.{name}'" if self.name else f"{type(self).__name__} '{name}'"
-        self._settings[name] = self._base[name] = self.settings()[name].read(
+        self.parameter_values[name] = self.given_parameters[name] = self.settings()[name].read(
             value, where=where, bare=bare
         )
 
     def setting(self, name: str) -> Any:
         """The value that was set (for numeric parameters: before dispersions, without members)."""
-        return self._base[name]
+        return self.given_parameters[name]
 
     def is_default(self, name: str) -> bool:
         """Whether a parameter stands as its declaration has it."""
         declared = self.settings()[name]
-        if declared.required or name not in self._base:
-            return name not in self._base
+        if declared.required or name not in self.given_parameters:
+            return name not in self.given_parameters
         default = declared.read(declared.default, where=f"default of '{name}'")
-        return bool(np.all(np.asarray(self._base[name] == default)))
+        return bool(np.all(np.asarray(self.given_parameters[name] == default)))
 
     def takes(self, name: str) -> bool:
         """Whether a parameter has any effect, as the others are now; override where it may not."""
@@ -261,7 +275,9 @@ class Component(Shown):
 
     def missing_settings(self) -> list[str]:
         """Names of required parameters that were not given."""
-        return [n for n, s in self.settings().items() if s.required and n not in self._base]
+        return [
+            n for n, s in self.settings().items() if s.required and n not in self.given_parameters
+        ]
 
     def __getitem__(self, port: str) -> PortRef:
         """Name a port: ``imu["delta_v"]``.
@@ -288,7 +304,7 @@ class Component(Shown):
         from terrafix.cosim.declare.display import component_shown
 
         title = type(self).__name__ + (f" '{self.name}'" if self.name else "")
-        return component_shown(title, self.rate, self.settings(), self._base, self.ports)
+        return component_shown(title, self.rate, self.settings(), self.given_parameters, self.ports)
 
     def inputs(self) -> dict[str, Port[object]]:
         """Input ports by name."""
@@ -314,22 +330,32 @@ class Component(Shown):
         self._environment = environment
         self.step_index = 0
         n = environment.n_members
-        for name, declared in self._declared.items():
+        for name, declared in self.declarations.items():
             if isinstance(declared, State):
                 field = declared.field
-                self._states[name] = np.empty((n, *field.fixed_shape), dtype=field.dtype)
-                self._states[name][...] = declared.start
-            elif isinstance(declared, Parameter) and name in self._base:
-                base = np.asarray(self._base[name], dtype=np.float64)
-                self._settings[name] = np.broadcast_to(base, (n, *base.shape)).copy()
+                self.state_arrays[name] = np.empty((n, *field.fixed_shape), dtype=field.dtype)
+                self.state_arrays[name][...] = declared.start
+            elif isinstance(declared, Parameter) and name in self.given_parameters:
+                base = np.asarray(self.given_parameters[name], dtype=np.float64)
+                self.parameter_values[name] = np.broadcast_to(base, (n, *base.shape)).copy()
 
     def release(self) -> None:
         """Give back what `bind` lent; the component can be simulated again."""
         self._environment = None
-        self._views = {}
-        self._states = {}
+        self.port_views = {}
+        self.state_arrays = {}
         self._streams = {}
-        self._settings = dict(self._base)
+        self.parameter_values = dict(self.given_parameters)
+
+    @property
+    def lent(self) -> Environment | None:
+        """What a simulation lends it now; None outside of one."""
+        return self._environment
+
+    @classmethod
+    def has_step(cls) -> bool:
+        """Whether it can step: whether a class provides `_step_impl`."""
+        return cls._step_impl is not Component._step_impl
 
     @property
     def environment(self) -> Environment:
@@ -411,14 +437,14 @@ class Component(Shown):
 
     def get_state(self) -> dict[str, Any]:
         """Arrays and plain values that reproduce this component."""
-        saved: dict[str, Any] = {name: array.copy() for name, array in self._states.items()}
+        saved: dict[str, Any] = {name: array.copy() for name, array in self.state_arrays.items()}
         extra = deepcopy(self._extra_state())
         return {"states": saved, "step_index": self.step_index, "extra": extra}
 
     def set_state(self, saved: dict[str, Any]) -> None:
         """Put back what `get_state` gave."""
         for name, array in saved["states"].items():
-            self._states[name][...] = array
+            self.state_arrays[name][...] = array
         self.step_index = int(saved["step_index"])
         self._set_extra_state(deepcopy(saved["extra"]))
 

@@ -34,7 +34,7 @@ def type_content(name: str) -> dict[str, Any]:
         If there is no such type, or it cannot be imported.
     """
     kind = component_type(name)
-    ports = {n: p for n, p in kind._declared.items() if isinstance(p, Port)}
+    ports = {n: p for n, p in kind.declarations.items() if isinstance(p, Port)}
     return {
         "type": name,
         "class": f"{kind.__module__}:{kind.__qualname__}",

@@ -77,12 +77,12 @@ class Setting(Declaration, Generic[Value_co]):
         if obj is None:
             return self
         try:
-            return obj._settings[self.name]  # type: ignore[attr-defined, no-any-return]
+            return obj.parameter_values[self.name]  # type: ignore[attr-defined, no-any-return]
         except KeyError:
             raise self._absent(obj, f"has no value yet: it takes {self.kind()}") from None
 
     def __set__(self, obj: object, value: object) -> None:
-        obj._set(self.name, value)  # type: ignore[attr-defined]
+        obj.set_parameter(self.name, value)  # type: ignore[attr-defined]
 
 
 class Parameter(Setting[FloatArray]):
@@ -181,7 +181,7 @@ class Parameter(Setting[FloatArray]):
                 what = f"has shape {array.shape}" if array.ndim else "is one number"
                 raise ConfigurationError(f"{where} {what}; {self._wanted()}")
         array = self._convert(array, unit, where=where, bare=bare)
-        self._check_range(array, where)
+        self.check_range(array, where)
         return array
 
     def _convert(
@@ -221,7 +221,8 @@ class Parameter(Setting[FloatArray]):
             value = array.tolist() if array.size <= MOST_SHOWN else "not finite everywhere"
             raise ConfigurationError(f"{where} is {value}; it must be finite")
 
-    def _check_range(self, array: FloatArray, where: str) -> None:
+    def check_range(self, array: FloatArray, where: str) -> None:
+        """Raise ConfigurationError if a number is not finite or out of the declared range."""
         self._check_finite(array, where)
         unit = "" if self.unit in ("1", "") else f" {self.unit_text()}"
         limits: list[tuple[NDArray[np.bool_], str]] = []

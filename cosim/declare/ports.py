@@ -194,7 +194,7 @@ class Port(Declaration, Generic[View_co]):
         if obj is None:
             return self
         try:
-            return obj._views[self.name]  # type: ignore[attr-defined, no-any-return]
+            return obj.port_views[self.name]  # type: ignore[attr-defined, no-any-return]
         except KeyError:
             what = f'is a port: it has a value only in a simulation; ["{self.name}"] names it'
             raise self._absent(obj, what) from None
@@ -213,7 +213,7 @@ class Output(Port[FloatArray]):
     """A signal that is published; assigning copies into the published array."""
 
     def __set__(self, obj: object, value: object) -> None:
-        array = obj._views[self.name]  # type: ignore[attr-defined]
+        array = obj.port_views[self.name]  # type: ignore[attr-defined]
         try:
             array[...] = value
         except (TypeError, ValueError) as error:
@@ -330,7 +330,7 @@ class SharedOutput(_Shared):
     """One value for all members; assigning publishes the array itself, without a copy."""
 
     def __set__(self, obj: object, value: object) -> None:
-        obj._views[self.name].put(value)  # type: ignore[attr-defined]
+        obj.port_views[self.name].put(value)  # type: ignore[attr-defined]
 
 
 class State(Declaration):
@@ -362,12 +362,12 @@ class State(Declaration):
         if obj is None:
             return self
         try:
-            return obj._states[self.name]  # type: ignore[attr-defined, no-any-return]
+            return obj.state_arrays[self.name]  # type: ignore[attr-defined, no-any-return]
         except KeyError:
             raise self._absent(obj, "is a state: it has a value only in a simulation") from None
 
     def __set__(self, obj: object, value: object) -> None:
-        obj._states[self.name][...] = value  # type: ignore[attr-defined]
+        obj.state_arrays[self.name][...] = value  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True)

@@ -104,14 +104,14 @@ def _output(
 ) -> Slot:
     if port.kind == "shared":
         shared = SharedSlot(port.single, name)
-        component._views[name] = shared
+        component.port_views[name] = shared
         return shared
     if port.kind == "message":
         writer = MessageWriter(port.name, port.fields, n_members, active)
-        component._views[name] = writer
+        component.port_views[name] = writer
         return writer.slot
     slot = SignalSlot(port.fields, n_members)
-    component._views[name] = (
+    component.port_views[name] = (
         BundleView(slot.views, writable=True) if port.is_bundle else slot.views[""]
     )
     return slot
@@ -129,7 +129,7 @@ def _unconnected(component: Component, name: str, port: Port[Any], n_members: in
         view = _signal_view(port, slot)
         if port.window:
             view = WindowView(slot.views[""], 1, None)
-    component._views[name] = view
+    component.port_views[name] = view
 
 
 def _signal_view(port: Port[Any], slot: SignalSlot) -> Any:
@@ -155,7 +155,7 @@ def _connect(
             held = SharedSlot(port.single, name)
             wiring.latch[path].append(CopyShared(slot, held))
             wiring.keepers[f"copy:{connection.target}"] = slot = held
-        component._views[name] = slot
+        component.port_views[name] = slot
         return
     source_port = plan.flat.port(connection.source)
     factor = port_factor(source_port, port)
@@ -163,7 +163,7 @@ def _connect(
         source = plan.flat.components[source_path]
         capacity = _window_capacity(source.rate, component.rate)
         window = WindowView(slot.views[""], capacity, factor)
-        component._views[name] = wiring.keepers[f"window:{connection.target}"] = window
+        component.port_views[name] = wiring.keepers[f"window:{connection.target}"] = window
         wiring.after[source_path].append(
             lambda tick, t: window.collect(source.scheduled(t))  # noqa: ARG005
         )
@@ -191,7 +191,7 @@ def _connect(
     if isinstance(slot, MessageSlot):
         _read_message(wiring, connection, component, name, port, slot)
     else:
-        component._views[name] = _signal_view(port, slot)
+        component.port_views[name] = _signal_view(port, slot)
 
 
 def _read_message(
@@ -203,7 +203,7 @@ def _read_message(
     slot: MessageSlot,
 ) -> MessageReader:
     reader = MessageReader(slot, depth=port.queue, at_zero=component.takes_messages_at_start)
-    component._views[name] = wiring.readers[connection.target] = reader
+    component.port_views[name] = wiring.readers[connection.target] = reader
     wiring.keepers[f"reader:{connection.target}"] = reader
     wiring.before[connection.target.rpartition(".")[0]].append(reader.refresh)
     return reader

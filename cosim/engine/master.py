@@ -201,7 +201,7 @@ class Master:
                 f"t = {self.seconds(self.tick):.9g} s\n  make another one, or set an earlier state"
             )
         for path, component in self.plan.flat.components.items():
-            if component._environment is not self._lent[path]:
+            if component.lent is not self._lent[path]:
                 raise ConfigurationError(
                     f"'{path}' has been terminated, or another simulation of the same system has "
                     "taken it over\n  run one after the other, or build the system twice"
@@ -273,7 +273,7 @@ class Master:
         self._terminated = True
         failure: tuple[str, Exception] | None = None
         for path, component in self.plan.flat.components.items():
-            if component._environment is not self._lent[path]:
+            if component.lent is not self._lent[path]:
                 continue
             try:
                 component.terminate()

@@ -169,12 +169,12 @@ class Simulation:
                 component = self.plan.flat.components[owner]
                 declared = component.settings().get(name)
                 if isinstance(declared, Parameter):
-                    found[target] = (declared.unit_text(), component._settings[name].copy())
+                    found[target] = (declared.unit_text(), component.parameter_values[name].copy())
                 else:
-                    state = component._declared[name]
+                    state = component.declarations[name]
                     assert isinstance(state, State)
                     unit = state.field.unit_text()
-                    found[target] = (unit, component._states[name].copy())
+                    found[target] = (unit, component.state_arrays[name].copy())
         return found
 
     def __repr__(self) -> str:

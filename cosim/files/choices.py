@@ -124,4 +124,4 @@ def refuse_parameter(load: Load, component: Component, key: str) -> None:
     load.refuse(f"'{component.name}' has no parameter '{key}'\n  {near}")
     for meant in component.missing_settings():
         if near == f"did you mean '{meant}'?":
-            component._base[meant] = None
+            component.given_parameters[meant] = None

@@ -247,7 +247,7 @@ def _component(
             refused += not _set(load, made, key, value, from_file=from_file)
     for key in made.missing_settings():
         if f"{name}.{key}" in load.withheld:
-            made._base[key] = None
+            made.given_parameters[key] = None
             refused += 1
     made.rate = load.attempt(_rate, timing, f"'{name}'") or made.rate
     if not refused:
@@ -271,17 +271,17 @@ def _set(load: Load, component: Component, key: str, value: Any, *, from_file: b
         refuse_parameter(load, component, key)
         return False
     before = len(load.problems)
-    load.attempt(component._set, key, value, bare=not from_file)
+    load.attempt(component.set_parameter, key, value, bare=not from_file)
     if len(load.problems) > before:
-        component._base[key] = None
+        component.given_parameters[key] = None
         return False
     setting = settings[key]
     if isinstance(setting, FileTable) and from_file:
         placed = setting.beside(component.setting(key), load.folder)
-        component._settings[key] = component._base[key] = placed
+        component.parameter_values[key] = component.given_parameters[key] = placed
     if isinstance(setting, PATHS) and from_file:
         file = component.setting(key)
-        component._settings[key] = component._base[key] = load.folder / file
+        component.parameter_values[key] = component.given_parameters[key] = load.folder / file
     return True
 
 

@@ -65,7 +65,7 @@ def system_text(system: System) -> str:
         lines += ["", f"[component.{names[path]}]", f'type = "{types[kind]}"']
         lines += _rate_lines(component.rate)
         for name, setting in component.settings().items():
-            if name in component._base:
+            if name in component.given_parameters:
                 value = component.setting(name)
                 if value is None:
                     continue

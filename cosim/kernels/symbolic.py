@@ -107,7 +107,7 @@ class SymbolicComponent(Component):
     def model(self) -> SymbolicModel:
         """The model, built on first need for the present settings."""
         structure = tuple(
-            (n, self._base.get(n))
+            (n, self.given_parameters.get(n))
             for n, s in self.settings().items()
             if not isinstance(s, Parameter)
         )
@@ -210,13 +210,14 @@ class SymbolicComponent(Component):
         super().bind(environment)
         n = environment.n_members
         for name in self.model.states:
-            self._states[name] = np.zeros((n, *self._state_shape(name)))
+            self.state_arrays[name] = np.zeros((n, *self.state_shape(name)))
         self._dt = np.zeros(1)
         self._t = np.zeros(1)
         self._failed = np.zeros(n, dtype=np.uint8)
         self.messages: dict[str, FloatArray] = {}
 
-    def _state_shape(self, name: str) -> tuple[int, ...]:
+    def state_shape(self, name: str) -> tuple[int, ...]:
+        """Shape of a state of one member; ``()`` for a scalar."""
         shape = self.model.shape(name)
         return () if shape == (1,) else shape
 
@@ -226,7 +227,7 @@ class SymbolicComponent(Component):
         model = self.model
         arrays = self.arguments()
         results = {n: self._output_array(n) for n in model.outputs}
-        results |= {f"state:{n}": self._states[n] for n in model.states}
+        results |= {f"state:{n}": self.state_arrays[n] for n in model.states}
         keys = {n: stream_key(env.seed, env.path, n) for n in model.noise}
         self.kernel = kernel
         self.call: BoundKernel = kernel.bind(
@@ -243,8 +244,8 @@ class SymbolicComponent(Component):
         """The arrays that a step reads, by the names of `kernel_request`."""
         model = self.model
         arrays = {n: self._input_array(n) for n in model.inputs}
-        arrays |= {f"state:{n}": self._states[n] for n in model.states}
-        arrays |= {n: self._settings[n] for n in model.parameters}
+        arrays |= {f"state:{n}": self.state_arrays[n] for n in model.states}
+        arrays |= {n: self.parameter_values[n] for n in model.parameters}
         if self.environment.quiet:
             n_members = self.n_members
             arrays |= {n: np.zeros((n_members, *model.shape(n))) for n in model.noise}
@@ -252,7 +253,7 @@ class SymbolicComponent(Component):
 
     def _input_array(self, name: str) -> FloatArray:
         head, _, tail = name.partition(".")
-        view = self._views[head]
+        view = self.port_views[head]
         if isinstance(view, MessageReader):
             if tail == "fresh":
                 return view.fresh_number
@@ -265,7 +266,7 @@ class SymbolicComponent(Component):
 
     def _output_array(self, name: str) -> FloatArray:
         head, _, tail = name.partition(".")
-        view = self._views[head]
+        view = self.port_views[head]
         if isinstance(view, MessageWriter):
             self.messages.setdefault(head, np.ones(self.n_members))
             if tail == "valid":
@@ -284,14 +285,14 @@ class SymbolicComponent(Component):
         model, env = self.model, self.environment
         for name, port in self.inputs().items():
             if port.needed_at_start:
-                self.fail(~self._views[name].fresh, f"no '{name}' was received at t = 0")
+                self.fail(~self.port_views[name].fresh, f"no '{name}' was received at t = 0")
         function = model.initial_function()
         rows = [self._input_array(n).reshape(self.n_members, -1) for n in model.inputs]
-        rows += [self._settings[n].reshape(self.n_members, -1) for n in model.parameters]
+        rows += [self.parameter_values[n].reshape(self.n_members, -1) for n in model.parameters]
         rows += [self.normals(n, int(np.prod(model.shape(n)))) for n in model.noise]
         clock = [0.0] * ((model.step is not None) + (model.time is not None))
         targets = [*(self._output_array(n) for n in model.outputs)]
-        targets += [self._states[n] for n in model.states]
+        targets += [self.state_arrays[n] for n in model.states]
         flying = np.flatnonzero(env.active)
         values = _each_member(function, [r[flying] for r in rows], clock, len(flying))
         finite = np.ones(len(flying), dtype=np.bool_)
@@ -339,7 +340,7 @@ class SymbolicComponent(Component):
         for name, valid in self.messages.items():
             mask = valid > 0.5
             if mask.any():
-                self._views[name].publish_draft(t, mask)
+                self.port_views[name].publish_draft(t, mask)
 
 
 def _asked_for() -> tuple[str, ...]:

@@ -159,8 +159,8 @@ class Recorder:
     def history(self) -> tuple[NDArray[np.float64], Arrays]:
         """All samples: times (n,), and by name arrays (n, n_members, *shape)."""
         self.flush()
-        chunks = self._done if self.folder is None else _read_chunks(self.folder, self.name)
-        return _join(chunks, self.variables, [s.shape for s in self._sources])
+        chunks = self._done if self.folder is None else read_chunks(self.folder, self.name)
+        return join(chunks, self.variables, [s.shape for s in self._sources])
 
     def get_state(self) -> dict[str, Any]:
         """What a checkpoint needs: everything sampled is flushed first."""
@@ -174,7 +174,7 @@ class Recorder:
             mine[:] = kept
         self._used = 0
         if self.folder is None:
-            times, arrays = _join(self._done, self.variables, [s.shape for s in self._sources])
+            times, arrays = join(self._done, self.variables, [s.shape for s in self._sources])
             self._done = [(times[:n], [arrays[v.name][:n] for v in self.variables])]
         else:
             self._cut_files(n)
@@ -204,11 +204,12 @@ class Recorder:
             )
 
 
-def _join(
+def join(
     chunks: list[tuple[NDArray[np.float64], list[NDArray[Any]]]],
     variables: list[Variable],
     shapes: list[tuple[int, ...]],
 ) -> tuple[NDArray[np.float64], Arrays]:
+    """Times and values of all samples, from chunks in their order."""
     if not chunks:
         empty = {
             v.name: np.empty((0, *shape), dtype=v.field.dtype)
@@ -234,7 +235,8 @@ def _read_chunk(file: Path) -> tuple[NDArray[np.float64], list[NDArray[Any]]]:
         raise ConfigurationError(f"records in '{file}' are damaged: {error}") from error
 
 
-def _read_chunks(folder: Path, name: str) -> list[tuple[NDArray[np.float64], list[NDArray[Any]]]]:
+def read_chunks(folder: Path, name: str) -> list[tuple[NDArray[np.float64], list[NDArray[Any]]]]:
+    """Read what a record left in a folder, in the order it was written."""
     return [_read_chunk(file) for file in chunk_files(folder, name)]
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.basics.files import replacing
 from terrafix.cosim.memory.fields import Field
-from terrafix.cosim.records.recorder import MANIFEST, Recorder, Variable, _join, _read_chunks
+from terrafix.cosim.records.recorder import MANIFEST, Recorder, Variable, join, read_chunks
 from terrafix.cosim.records.recorder import SCHEMA as RECORDS_SCHEMA
 
 if TYPE_CHECKING:
@@ -205,11 +205,11 @@ def salvage(folder: str | Path) -> xarray.Dataset:
             )
             for v in variables
         ]
-        chunks = _read_chunks(folder, name)
+        chunks = read_chunks(folder, name)
         if not chunks:
             continue
         declared = [Variable(v["name"], f) for v, f in zip(variables, fields, strict=True)]
-        times, arrays = _join(chunks, declared, [])
+        times, arrays = join(chunks, declared, [])
         records[name] = (times, [(d.name, d.field, arrays[d.name]) for d in declared])
     about = description["about"]
     members = np.asarray(about["members"], dtype=np.int64)

@@ -129,13 +129,13 @@ def _component_problems(
     path: str, component: Component, duration: Fraction | None
 ) -> Iterator[TerrafixError]:
     missing = component.missing_settings()
-    refused = any(value is None for value in component._base.values())  # and reported
+    refused = any(value is None for value in component.given_parameters.values())  # and reported
     for name in missing:
         kind = component.settings()[name].kind()
         yield ConfigurationError(f"'{path}' needs a value for '{name}': it takes {kind}")
     if component.rate is None:
         yield RateError(f'\'{path}\' has no rate\n  give it a period ("0.01 s") or hz ("100 Hz")')
-    elif component.rate.last > 0 and type(component)._step_impl is Component._step_impl:
+    elif component.rate.last > 0 and not component.has_step():
         yield ConfigurationError(
             f"'{path}' cannot step: {type(component).__name__} must provide _step_impl(t, dt)"
         )

@@ -143,11 +143,11 @@ class Dispersion:
                     "  choose otherwise, or leave it out"
                 )
             return setting
-        state = component._declared.get(name)
+        state = component.declarations.get(name)
         if isinstance(state, State) and np.dtype(state.field.dtype) == np.float64:
             return Parameter(shape=state.field.fixed_shape, unit=state.field.unit)
         numeric = [n for n, s in settings.items() if isinstance(s, Parameter)]
-        numeric += [n for n, d in component._declared.items() if isinstance(d, State)]
+        numeric += [n for n, d in component.declarations.items() if isinstance(d, State)]
         raise ConfigurationError(
             f"dispersion '{self.name}' feeds '{target}', which is no numeric parameter\n"
             f"  {nearest(name, numeric, what='numeric parameters')}"
@@ -284,7 +284,9 @@ class Dispersion:
             owner, _, name = target.rpartition(".")
             component = components[owner]
             declared = component.settings().get(name)
-            values = (component._settings if declared is not None else component._states)[name]
+            values = (
+                component.parameter_values if declared is not None else component.state_arrays
+            )[name]
             if self.kind == "list":
                 values[...] = drawn
             elif self.kind == "log_uniform":
@@ -292,7 +294,7 @@ class Dispersion:
             else:
                 values += drawn
             if isinstance(declared, Parameter):
-                declared._check_range(values, f"'{target}' after dispersion '{self.name}'")
+                declared.check_range(values, f"'{target}' after dispersion '{self.name}'")
         return drawn
 
     def _drawn(

@@ -18,7 +18,11 @@ def configuration(plan: Plan) -> dict[str, Any]:
             path: {
                 "type": _type(type(c)),
                 "rate": None if c.rate is None else c.rate.identity(),
-                **{n: s.write(c.setting(n)) for n, s in c.settings().items() if n in c._base},
+                **{
+                    n: s.write(c.setting(n))
+                    for n, s in c.settings().items()
+                    if n in c.given_parameters
+                },
             }
             for path, c in flat.components.items()
         },

@@ -97,10 +97,10 @@ class Inputs(Component):
         for name, port in self.ports.items():
             values = {f: self._draw(f or name, f"{name}.{f}", port.fields[f]) for f in port.fields}
             if port.kind == "message":
-                self._views[name].publish(t, **values)
+                self.port_views[name].publish(t, **values)
             elif port.is_bundle:
                 for f, value in values.items():
-                    self._views[name].__dict__[f][...] = value
+                    self.port_views[name].__dict__[f][...] = value
             else:
                 setattr(self, name, values[""])
 
@@ -126,8 +126,8 @@ def recording(tmp_path_factory):
     """What playback plays: attitude and position of 100 members, as if recorded on a run."""
     folder = tmp_path_factory.mktemp("recording")
     orbit, attitude = component_type("orbit"), component_type("lvlh_attitude")
-    played = {n: orbit._declared[n] for n in ("r_e", "v_e")}
-    played |= {n: attitude._declared[n] for n in ("q_be", "delta_v_b", "delta_theta_b")}
+    played = {n: orbit.declarations[n] for n in ("r_e", "v_e")}
+    played |= {n: attitude.declarations[n] for n in ("q_be", "delta_v_b", "delta_theta_b")}
     kind = type("Played", (Inputs,), {n: source_of(p) for n, p in played.items()})
     system = System("recording")
     made = system.add(kind(), name="original")
@@ -208,7 +208,7 @@ def test_a_state_set_back_continues_to_the_same_bytes(build, tmp_path):
 def test_ports_and_parameters_say_what_they_are(name):
     kind = component_type(name)
     assert kind.__doc__
-    for name, declared in kind._declared.items():
+    for name, declared in kind.declarations.items():
         if isinstance(declared, Parameter) or not hasattr(declared, "fields"):
             assert declared.doc, f"{kind.__name__}.{name} has no doc"
             continue

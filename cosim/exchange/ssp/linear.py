@@ -23,19 +23,19 @@ class Linear(Component):
 
     def prepare(self) -> None:
         """Declare the ports."""
-        shape: Any = () if self._base["flat"] else (self._base["width"],)
-        x = Input(shape, unit=self._base["unit_in"], doc="what is transformed")
-        y = Output(shape, unit=self._base["unit_out"], doc="factor * x + offset")
+        shape: Any = () if self.given_parameters["flat"] else (self.given_parameters["width"],)
+        x = Input(shape, unit=self.given_parameters["unit_in"], doc="what is transformed")
+        y = Output(shape, unit=self.given_parameters["unit_out"], doc="factor * x + offset")
         x.name, y.name = "x", "y"
         self.ports = {"x": x, "y": y}
         self._factor, self._offset = self._numbers("factor"), self._numbers("shift")
 
     def _numbers(self, name: str) -> Any:
-        values = np.array([float(v) for v in self._base[name].split(",")])
-        return values[0] if self._base["flat"] else values
+        values = np.array([float(v) for v in self.given_parameters[name].split(",")])
+        return values[0] if self.given_parameters["flat"] else values
 
     def _initialize_impl(self) -> None:
         self._step_impl(0.0, 0.0)
 
     def _step_impl(self, t: float, dt: float) -> None:
-        self._views["y"][...] = self._factor * self._views["x"] + self._offset
+        self.port_views["y"][...] = self._factor * self.port_views["x"] + self._offset

@@ -92,7 +92,7 @@ def fly(kind, monkeypatch, members=21, walls=None, stop=None):
     monkeypatch.setenv("TERRAFIX_KERNEL", kind)
     simulation = Simulation(built(), members=members)
     if walls is not None:
-        wall = simulation.plan.flat.components["source"]._settings["wall"]
+        wall = simulation.plan.flat.components["source"].parameter_values["wall"]
         wall[:] = walls[simulation.members]
     simulation.initialize()
     if stop is not None:
@@ -101,7 +101,7 @@ def fly(kind, monkeypatch, members=21, walls=None, stop=None):
         simulation.master.terminate()
         simulation = Simulation(built(), members=members)
         if walls is not None:
-            simulation.plan.flat.components["source"]._settings["wall"][:] = walls
+            simulation.plan.flat.components["source"].parameter_values["wall"][:] = walls
         simulation.set_state(saved)
     simulation.run_until(3)
     _, recorded = simulation.recorders[0].history()
@@ -169,7 +169,7 @@ def test_a_checkpoint_in_the_middle_changes_nothing(monkeypatch):
 def test_a_run_ends_where_the_last_member_fails(kind, monkeypatch):
     monkeypatch.setenv("TERRAFIX_KERNEL", kind)
     simulation = Simulation(built(), members=3)
-    simulation.plan.flat.components["source"]._settings["wall"][:] = 0.5, 0.75, 1.0
+    simulation.plan.flat.components["source"].parameter_values["wall"][:] = 0.5, 0.75, 1.0
     simulation.initialize()
     with pytest.raises(StepError, match=r"no member is left at t = 1\.02 s .*\n.*member 2"):
         simulation.run_until(3)

@@ -84,9 +84,9 @@ class Fmu(Component):
 
     def prepare(self) -> None:
         """Read the file, and declare its ports."""
-        archive = open_archive(self._base["file"])
+        archive = open_archive(self.given_parameters["file"])
         self._interface = found = read_interface(
-            archive, self._base["kind"], arrays=self._base["arrays"]
+            archive, self.given_parameters["kind"], arrays=self.given_parameters["arrays"]
         )
         archive.binary(
             (
@@ -98,7 +98,7 @@ class Fmu(Component):
         self._given = self._read_starts()
         self.ports = {port.name: self._port(port) for port in found.ports}
         for table in ("units", "frames"):
-            for name in self._base[table]:
+            for name in self.given_parameters[table]:
                 if name not in self.ports:
                     raise ConfigurationError(
                         f"'{self.name}.{table}' names '{name}', which is no port\n"
@@ -119,7 +119,7 @@ class Fmu(Component):
         return None if step is None else Fraction(str(step)).limit_denominator(10**9)
 
     def _port(self, port: ImportedPort) -> Port[Any]:
-        chosen = self._base["inputs_read"]
+        chosen = self.given_parameters["inputs_read"]
         at: Any = (port.at or "start") if chosen == "declared" else chosen
         fields = {n: self._field(port.name, q, f) for n, (q, f) in port.fields.items()}
         doc = next((q.doc for q, _ in port.fields.values()), "")
@@ -145,7 +145,7 @@ class Fmu(Component):
         return made
 
     def _field(self, port: str, quantity: Quantity, frame: str | None) -> Field:
-        unit, wanted = quantity.unit, self._base["units"].get(port)
+        unit, wanted = quantity.unit, self.given_parameters["units"].get(port)
         if wanted is not None and unit not in ("1", wanted):
             raise ConfigurationError(
                 f"'{self.name}.units' says {wanted} for '{port}', the FMU says {unit}\n"
@@ -153,7 +153,7 @@ class Fmu(Component):
             )
         if wanted is not None:
             quantity.unit = str(wanted)
-        other = self._base["frames"].get(port)
+        other = self.given_parameters["frames"].get(port)
         if other is not None and frame not in (None, other):
             raise ConfigurationError(
                 f"'{self.name}.frames' says {other} for '{port}', the FMU says {frame}"
@@ -170,7 +170,7 @@ class Fmu(Component):
         """Values of ``start``, converted to the units of the variables."""
         known = self.settable()
         values = {}
-        for name, value in self._base["start"].items():
+        for name, value in self.given_parameters["start"].items():
             if name not in known:
                 raise ConfigurationError(
                     f"'{self.name}.start': the FMU has no parameter or input '{name}'\n"
@@ -234,20 +234,20 @@ class Fmu(Component):
         inputs, self._input_at = grouped(read)
         outputs, self._output_at = grouped(written)
         setup = Setup(
-            str(Path(self._base["file"]).absolute()),
+            str(Path(self.given_parameters["file"]).absolute()),
             interface.kind,
             env.path,
             inputs,
             outputs,
             self._start_settings(),
             self._identities(),
-            self._base["solver"],
-            float(self._base["tolerance"]),
+            self.given_parameters["solver"],
+            float(self.given_parameters["tolerance"]),
         )
-        limit = float(self._base["time_limit"])
+        limit = float(self.given_parameters["time_limit"])
         self._fleet = (
             RemoteFleet(setup, env.n_members, limit)
-            if self._base["isolate"]
+            if self.given_parameters["isolate"]
             else Fleet(setup, env.n_members)
         )
         self._sequence = {p.name: np.zeros(env.n_members, np.int64) for p in self._outputs}
@@ -290,7 +290,7 @@ class Fmu(Component):
         return tuple(found)
 
     def _view(self, port: str, name: str) -> NDArray[Any]:
-        view = self._views[port]
+        view = self.port_views[port]
         if isinstance(view, BundleView):
             found: NDArray[Any] = view.__dict__[name]
             return found
@@ -329,7 +329,7 @@ class Fmu(Component):
     def _step_impl(self, t: float, dt: float) -> None:
         fleet = self._fleet
         assert fleet is not None
-        if self._first and self._base["hold_start_values"]:
+        if self._first and self.given_parameters["hold_start_values"]:
             self._take_inputs(late=False)
         else:
             for target, source in self._copies:
@@ -363,7 +363,7 @@ class Fmu(Component):
         """What came since the last step, for the members it came to."""
         sent = []
         for port in self._messages:
-            view = self._views[port.name]
+            view = self.port_views[port.name]
             if not isinstance(view, MessageReader) or not view.fresh.any():
                 continue
             rows = np.flatnonzero(view.fresh)
@@ -387,7 +387,7 @@ class Fmu(Component):
                 continue
             self._sequence[port.name] = number
             t = fleet.outputs[:, self._output_at[port.name, "t"]][:, 0]
-            writer = self._views[port.name]
+            writer = self.port_views[port.name]
             for name, (quantity, _) in port.fields.items():
                 rows = fleet.outputs[:, self._output_at[port.name, name]]
                 writer.draft[name][...] = rows.reshape(self.n_members, *quantity.shape)

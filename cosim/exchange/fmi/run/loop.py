@@ -40,9 +40,11 @@ class FmuLoop(Component):
 
     def prepare(self) -> None:
         """Read the files, and declare the ports that are not connected within."""
-        self._parts = {name: self._part(name, file) for name, file in self._base["files"].items()}
+        self._parts = {
+            name: self._part(name, file) for name, file in self.given_parameters["files"].items()
+        }
         self._links = [
-            self._link(text) for text in self._base["connect"].split(",") if text.strip()
+            self._link(text) for text in self.given_parameters["connect"].split(",") if text.strip()
         ]
         self._factors = [
             port_factor(self._parts[a].ports[y], self._parts[b].ports[u])
@@ -133,7 +135,7 @@ class FmuLoop(Component):
         """Take the inputs that come from outside."""
         for name, part in self._parts.items():
             for port in part.inputs():
-                view = self._views.get(f"{name}_{port}")
+                view = self.port_views.get(f"{name}_{port}")
                 if view is None:
                     continue
                 rows = view.reshape(self.n_members, -1)
@@ -157,8 +159,8 @@ class FmuLoop(Component):
         self._outside()
         for fleet in self._fleets.values():
             fleet.mark()
-        tolerance = self._settings["tolerance"]
-        for _ in range(self._base["most_iterations"]):
+        tolerance = self.parameter_values["tolerance"]
+        for _ in range(self.given_parameters["most_iterations"]):
             for name, fleet in self._fleets.items():
                 self._report(name, fleet.step(self._t, dt, (), self._gone()))
             change = self._inside()
@@ -168,7 +170,7 @@ class FmuLoop(Component):
             for fleet in self._fleets.values():
                 fleet.return_to_mark()
         else:
-            most = self._base["most_iterations"]
+            most = self.given_parameters["most_iterations"]
             self.fail(wanting, f"signals did not settle in {most} repetitions of a step")
         self._t = t
         self._publish()
@@ -181,7 +183,7 @@ class FmuLoop(Component):
         for name, part in self._parts.items():
             for port in part.outputs():
                 rows = self._fleets[name].outputs[:, self._at[name, port]]
-                view = self._views[f"{name}_{port}"]
+                view = self.port_views[f"{name}_{port}"]
                 view[...] = rows.reshape(view.shape)
 
     def _report(self, name: str, failures: dict[int, str]) -> None:

@@ -344,7 +344,7 @@ def start_values(system: System, plan: Plan, path: str) -> dict[str, dict[str, A
         for name, port in component.inputs().items():
             if port.at == "start":
                 continue  # nothing is held at t = 0: the declared default
-            view = component._views[name]
+            view = component.port_views[name]
             if isinstance(view, MessageReader):
                 if not view.sequence[0]:
                     continue

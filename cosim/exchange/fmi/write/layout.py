@@ -416,7 +416,7 @@ class Layout:
         taken = {v.name for v in self.reals}
         for name in model.derivatives:
             output = model.outputs.get(name)
-            shape = component._state_shape(name)
+            shape = component.state_shape(name)
             same = output is not None and ca.is_equal(ca.SX(output), model.states[name], 0)
             if same:
                 variable = next(v for v in self.reals if v.name == name)
