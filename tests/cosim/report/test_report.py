@@ -5,16 +5,19 @@ import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 from campaign_parts import scalar_system
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.campaign.campaign import run_campaign
+from terrafix.cosim.lincov.deviations import linear_covariance
 from terrafix.cosim.report.figures import save_figures
 from terrafix.cosim.report.reading import read_campaign
 from terrafix.cosim.report.report import write_report
 
+OPEN_LOOP = Path(__file__).parents[3] / "examples" / "spacecraft_sar_open_loop.toml"
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chrome"))), None)
 
 
@@ -116,3 +119,29 @@ def test_what_is_no_campaign_is_refused(folder, tmp_path):
         write_report(unfinished)
     with pytest.raises(ConfigurationError, match="there is no folder"):
         write_report(folder, tmp_path / "no" / "report.html")
+
+
+def test_a_prediction_is_made_once_and_kept(tmp_path, monkeypatch):
+    """The second report reads what the first one kept, and a damaged file is made anew."""
+    from terrafix.cosim.campaign.batch import FileSource
+    from terrafix.cosim.report import report
+
+    source = FileSource(str(OPEN_LOOP), (("case", "TC-2"),))
+    folder = tmp_path / "c"
+    run_campaign(source, runs=4, duration="16.4", workers=1, out=folder)
+    made = []
+
+    def counted(*arguments, **options):
+        made.append(linear_covariance(*arguments, **options))
+        return made[-1]
+
+    monkeypatch.setattr(report, "linear_covariance", counted)
+    first, again = read_campaign(folder), read_campaign(folder)
+    report.predict(first)
+    report.predict(again)
+    assert len(made) == 1
+    assert again.notes == []
+    assert again.prediction.sigma.tobytes() == made[0].sigma.tobytes()
+    (folder / report.LINCOV).write_bytes(b"damaged")
+    report.predict(again)
+    assert len(made) == 2
