@@ -69,7 +69,7 @@ def _hundred(scale: float, threads: int) -> dict[str, Any]:
     import xarray  # noqa: F401
 
     from terrafix.cosim.campaign.batch import layouts
-    from terrafix.cosim.campaign.statistics import Statistics, block_of
+    from terrafix.cosim.campaign.statistics.ensemble import Statistics, block_of
     from terrafix.cosim.campaign.verdict import judge
     from terrafix.cosim.engine.simulation import Simulation
 
@@ -184,7 +184,7 @@ def thousand_runs(scale: float) -> dict[str, Any]:
         (path,) = result.statistics
         s = result.statistics[path]
         nis = s.sums["nis_sum"].sum() / s.sums["nis_n"].sum()
-        found[f"nees_{name}"] = float(s.mean_of("nees")[1:].mean())
+        found[f"nees_{name}"] = float(s["nees"][1:].mean())
         found[f"nis_{name}"] = float(nis)
         found[f"verdict_{name}"] = result.verdicts[path].text
     return found | {"wall": result.wall_s, "memory": _memory()}
@@ -220,8 +220,8 @@ def _against_lincov(result: Any, case: str, sets: Any) -> dict[str, Any]:
     found = linear_covariance(read_system(SYSTEM, [("case", case), *sets]))
     wall = time.perf_counter() - began
     s = next(iter(result.statistics.values()))
-    predicted = np.sqrt(np.diagonal(s.covariance_predicted, axis1=1, axis2=2))
-    sample = np.sqrt(np.diagonal(s.covariance_sample, axis1=1, axis2=2))
+    predicted = np.sqrt(np.diagonal(s["covariance_predicted"], axis1=1, axis2=2))
+    sample = np.sqrt(np.diagonal(s["covariance_sample"], axis1=1, axis2=2))
     return {
         "lincov_wall": wall,
         "lincov_predicted_end": float(np.abs(found.sigma_filter[-1] / predicted[-1] - 1).max()),

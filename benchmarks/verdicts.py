@@ -50,7 +50,7 @@ def fly(settings: dict[str, str], runs: int, seed: int) -> tuple[str, float, flo
     (path,) = result.statistics
     statistics = result.statistics[path]
     nis = statistics.sums["nis_sum"].sum() / statistics.sums["nis_n"].sum()
-    return result.verdicts[path].text, float(np.nanmean(statistics.mean_of("nees")[1:])), float(nis)
+    return result.verdicts[path].text, float(np.nanmean(statistics["nees"][1:])), float(nis)
 
 
 def main() -> None:

@@ -1,6 +1,10 @@
-"""Fields that several components share: an estimate, a fix, an innovation, a known state."""
+"""What passes between components, declared once: fields of messages, shapes of shared arrays."""
 
 from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
 
 from terrafix.cosim.memory.fields import Field
 
@@ -69,10 +73,37 @@ IMAGE = {
 }
 """An image formed with a member's own estimate."""
 
-RADAR_UNITS = ("Hz", "Hz", "Hz", "Hz/s", "s", "Hz")
-RADAR_LABELS = (
-    *("carrier", "prf", "sample_rate"),
-    *("chirp_rate", "pulse_length", "doppler_bandwidth"),
-)
-GRID_LABELS = ("latitude0", "longitude0", "latitude_step", "longitude_step", "mirrored")
-GRID_UNITS = ("rad", "rad", "rad", "rad", "1")
+RADAR: dict[str, Any] = {
+    "shape": (6,),
+    "unit": ("Hz", "Hz", "Hz", "Hz/s", "s", "Hz"),
+    "labels": (
+        *("carrier", "prf", "sample_rate"),
+        *("chirp_rate", "pulse_length", "doppler_bandwidth"),
+    ),
+}
+"""What a radar sends, and how its echo is sampled."""
+
+ECHO: dict[str, Any] = {"shape": (None, None), "dtype": np.complex64}
+"""Raw echo: lines, range cells."""
+
+HEIGHT: dict[str, Any] = {"shape": (None, None), "unit": "m", "dtype": np.float32}
+"""Heights of a terrain: latitudes, longitudes."""
+
+GRID: dict[str, Any] = {
+    "shape": (5,),
+    "unit": ("rad", "rad", "rad", "rad", "1"),
+    "labels": ("latitude0", "longitude0", "latitude_step", "longitude_step", "mirrored"),
+}
+"""Where the heights of a terrain lie: its first point, its spacing, and 1 where it is mirrored."""
+
+SURFACE: dict[str, Any] = {"shape": (6,)}
+"""What a terrain looks like to a radar: seed, strengths of its texture, its bright points."""
+
+AMPLITUDE: dict[str, Any] = {"shape": (None, None), "dtype": np.float32}
+"""Amplitude of a geocoded reference: rows, columns."""
+
+TIES: dict[str, Any] = {"shape": (None,)}
+"""Rows, or columns, of a reference's tie points."""
+
+PLACES: dict[str, Any] = {"shape": (None, None, 3), "unit": ("rad", "rad", "m")}
+"""Latitude, longitude and height of a reference's tie points: their rows, their columns."""

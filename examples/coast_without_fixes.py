@@ -9,23 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix.cosim.engine.run import Result, simulate
-from terrafix.cosim.files.readers import read_system
+import terrafix as tf
 
 SYSTEM = Path(__file__).parent / "spacecraft_sar_open_loop.toml"
 
 
-def main(*, members: int = 20, duration: str = "590.4", plot: str | None = None) -> Result:
+def main(*, members: int = 20, duration: str = "590.4", plot: str | None = None) -> tf.Result:
     """Fly the system without its fixes; print the position sigma at the end."""
-    system = read_system(SYSTEM, [("sar.look", "80 deg")])  # a boresight past the Earth: no fix
-    result = simulate(system, members=members, duration=duration)
+    system = tf.read_system(SYSTEM, [("sar.look", "80 deg")])  # a boresight past the Earth: no fix
+    result = tf.simulate(system, members=members, duration=duration)
     position = result.evaluation["position"]
     predicted, sample = (np.linalg.norm(position[k]) for k in ("sigma_predicted", "sigma_sample"))
     print(f"position sigma after {duration} s: predicted {predicted:.0f} m, sample {sample:.0f} m")
     if plot is not None:
-        from terrafix.cosim.show.plots import plot_result
-
-        plot_result(result.dataset, plot)
+        result.plot(plot)
     return result
 
 

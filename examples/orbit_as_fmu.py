@@ -18,27 +18,23 @@ import casadi as ca
 import fmpy
 import numpy as np
 
-from terrafix.cosim.engine.run import simulate
-from terrafix.cosim.exchange.fmi.run.component import Fmu
-from terrafix.cosim.exchange.fmi.write.export import export_fmu
-from terrafix.cosim.files.readers import read_system
-from terrafix.cosim.system.system import System
-from terrafix.models.geometry.earth import EARTH
-from terrafix.models.geometry.frames import earth_fixed_from_inertial
-from terrafix.models.motion.gravity import j2_acceleration
+import terrafix as tf
+from terrafix.models.geometry import earth, frames
+from terrafix.models.motion import gravity
 
+EARTH = earth.EARTH
 SYSTEM = Path(__file__).with_name("spacecraft_sar_open_loop.toml")
 DURATION = "120"
 
 
-def terrafix_orbit(system: System, folder: Path) -> Fmu:
+def terrafix_orbit(system: tf.System, folder: Path) -> tf.Component:
     """Export the system's own orbit; co-simulation, bit for bit the native component."""
     file = folder / "orbit.fmu"
-    export_fmu(system, file, component="orbit")
-    return Fmu(file=file, rate=system.find("orbit").rate)
+    tf.export_fmu(system, file, component="orbit")
+    return tf.components.fmu(file=file, rate=system.find("orbit").rate)
 
 
-def casadi_orbit(system: System, folder: Path) -> Fmu:
+def casadi_orbit(system: tf.System, folder: Path) -> tf.Component:
     """Have CasADi export the same equations: model exchange, integrated here by CVode."""
     dae = ca.DaeBuilder("orbit")
     t = dae.add("time", "independent", {})
@@ -47,14 +43,16 @@ def casadi_orbit(system: System, folder: Path) -> Fmu:
         return [dae.add(f"{name}[{k + 1}]", *kind, {}) for k in range(3)]
 
     r, v, p = vector("r_i"), vector("v_i"), ca.SX.sym("p", 3)
-    gravity = ca.Function("gravity", [p], [j2_acceleration(p, EARTH.mu, EARTH.radius, EARTH.j2)])
-    acceleration = ca.vertsplit(gravity(ca.vertcat(*r)))
+    a_p = gravity.j2_acceleration(p, EARTH.mu, EARTH.radius, EARTH.j2)
+    acceleration = ca.vertsplit(ca.Function("gravity", [p], [a_p])(ca.vertcat(*r)))
     for state, rate in zip([*r, *v], [*v, *acceleration], strict=True):
         dae.eq(dae.der(state), rate)
     arguments = [ca.SX.sym("r", 3), ca.SX.sym("v", 3), ca.SX.sym("t")]
     angle = EARTH.rotation_rate * arguments[2]
     turn = ca.Function(
-        "turn", arguments, earth_fixed_from_inertial(*arguments[:2], angle, EARTH.rotation_rate)
+        "turn",
+        arguments,
+        frames.earth_fixed_from_inertial(*arguments[:2], angle, EARTH.rotation_rate),
     )
     r_e, v_e = (ca.vertsplit(each) for each in turn(ca.vertcat(*r), ca.vertcat(*v), t))
     for name, values in (("r_e", r_e), ("v_e", v_e), ("delta_v_e", [ca.MX(0.0)] * 3)):
@@ -73,7 +71,7 @@ def casadi_orbit(system: System, folder: Path) -> Fmu:
             for here, inside in files.items():
                 archive.write(here, inside)
     ports = ("r_e", "v_e", "delta_v_e")
-    return Fmu(
+    return tf.components.fmu(
         file=folder / "orbit.fmu",
         rate=orbit.rate,
         units={"r_e": "m", "v_e": "m/s", "delta_v_e": "m/s"},
@@ -90,11 +88,11 @@ def main(arguments: list[str] | None = None) -> float:
     parser.add_argument("--exporter", choices=EXPORTERS, default="terrafix")
     parser.add_argument("--plot", metavar="FILE.png")
     options = parser.parse_args(arguments)
-    native = simulate(read_system(SYSTEM), members=1, duration=DURATION).dataset
+    native = tf.simulate(tf.read_system(SYSTEM), members=1, duration=DURATION).dataset
     with tempfile.TemporaryDirectory() as folder:
-        system = read_system(SYSTEM)
+        system = tf.read_system(SYSTEM)
         system.replace("orbit", EXPORTERS[options.exporter](system, Path(folder)))
-        flown = simulate(system, members=1, duration=DURATION).dataset
+        flown = tf.simulate(system, members=1, duration=DURATION).dataset
     apart = np.linalg.norm(flown["orbit.r_e"].values - native["orbit.r_e"].values, axis=-1)
     fix = flown["correct.innovation.accepted"].values
     print(f"{options.exporter}: the orbits are up to {apart.max():.3g} m apart over {DURATION} s")

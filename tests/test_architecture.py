@@ -22,7 +22,7 @@ ORDER = [
     *("models.radar", "models.images", "models.filters", "models"),
     *("cosim.basics", "cosim.show", "cosim.memory", "cosim.declare", "cosim.kernels"),
     *("cosim.system", "cosim.files", "cosim.records", "cosim.engine", "cosim.lincov"),
-    *("cosim.campaign", "cosim.report"),
+    *("cosim.campaign.statistics", "cosim.campaign", "cosim.report"),
     *("cosim.exchange.fmi.run", "cosim.exchange.fmi.write", "cosim.exchange.fmi.check"),
     *("cosim.exchange.fmi", "cosim.exchange.ssp", "cosim.exchange", "cosim"),
     *("components", "components.truth", "components.sensors", "components.images"),

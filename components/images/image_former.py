@@ -7,11 +7,9 @@ that estimate. Members whose estimates lead to the same focus share the image.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafix.components.fields import ACQUISITION, ESTIMATE, IMAGE
-from terrafix.components.sensors.echo import ECHO, RADAR
-from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.components.fields import ACQUISITION, ECHO, ESTIMATE, IMAGE, RADAR
+from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
@@ -24,6 +22,7 @@ from terrafix.cosim.declare.ports import (
     SharedInput,
     SharedOutput,
 )
+from terrafix.models.core.arrays import Single
 from terrafix.models.geometry.antenna import boresight_direction_array, nominal_antenna_array
 from terrafix.models.geometry.geolocation import ground_point
 from terrafix.models.radar.chirp import Radar
@@ -35,8 +34,6 @@ from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
 _HALF_SWATH = 3000.0
 """Slant range over which the growth of velocity is taken [m]."""
-
-Single = NDArray[np.float32]
 
 
 class ImageFormer(Component):
@@ -108,7 +105,7 @@ class ImageFormer(Component):
                 f"  receive more lines or cells, or set {self.name}.rows and {self.name}.columns"
             ) from error
 
-    def _form(self, t: float, imager: Imager, fresh: NDArray[np.bool_]) -> None:
+    def _form(self, t: float, imager: Imager, fresh: Mask) -> None:
         wavelength = imager.radar.wavelength
         velocity, slope = self._expected_velocity(wavelength)
         centroid, sigma = self._expected_centroid(wavelength)

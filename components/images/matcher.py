@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from terrafix.components.fields import ESTIMATE, FIX, IMAGE
-from terrafix.components.truth.terrain import GRID, HEIGHT, dem_from
-from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.components.fields import AMPLITUDE, ESTIMATE, FIX, GRID, HEIGHT, IMAGE, PLACES, TIES
+from terrafix.components.truth.terrain import dem_from
+from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
@@ -26,11 +24,6 @@ from terrafix.models.geometry.geolocation import ground_point, track_axes
 from terrafix.models.images.matching import KINDS, REASONS, Match, Searchable, matched
 from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import Dem
-
-AMPLITUDE: dict[str, Any] = {"shape": (None, None), "dtype": np.float32}
-TIES: dict[str, Any] = {"shape": (None,)}
-PLACES: dict[str, Any] = {"shape": (None, None, 3), "unit": ("rad", "rad", "m")}
-"""Ports of a reference and of those who read it."""
 
 
 class ImageMatcher(Component):
@@ -105,7 +98,7 @@ class ImageMatcher(Component):
             return
         self._publish(t, places, valid, dem)
 
-    def _publish(self, t: float, places: FloatArray, valid: Any, dem: Dem) -> None:
+    def _publish(self, t: float, places: FloatArray, valid: Mask, dem: Dem) -> None:
         n = self.n_members
         r_f_e, D = np.zeros((n, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
         latitude, longitude = places[valid, 0], places[valid, 1]
@@ -146,7 +139,7 @@ class ImageMatcher(Component):
             )
         return reference
 
-    def _require_coverage(self, reference: Reference, fresh: Any) -> None:
+    def _require_coverage(self, reference: Reference, fresh: Mask) -> None:
         """Raise where nothing was recognized because the reference is of another place."""
         r, v, P = (getattr(self.prior, k)[fresh] for k in ("r_e", "v_e", "P"))
         p = ground_point(r, v, self.image.slant_range[fresh], self.image.sine[fresh])

@@ -9,17 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix.components.images.matcher import AMPLITUDE, PLACES, TIES
-from terrafix.components.sensors.echo import (
-    RADAR,
-    common,
+from terrafix.components.fields import AMPLITUDE, GRID, HEIGHT, PLACES, RADAR, SURFACE, TIES
+from terrafix.components.sensors.files import (
     file_of_step,
-    generator,
     read_lines,
     recorded_files,
     require_files,
 )
-from terrafix.components.truth.terrain import GRID, HEIGHT, SURFACE, dem_from, scene_from
+from terrafix.components.shared import common, generator
+from terrafix.components.truth.terrain import dem_from, scene_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component

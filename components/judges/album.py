@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from terrafix.components.fields import IMAGE, XYZ
-from terrafix.components.images.matcher import AMPLITUDE
+from terrafix.components.fields import AMPLITUDE, IMAGE, XYZ
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError

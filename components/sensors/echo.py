@@ -9,27 +9,31 @@ apply the fix that much later; this delay is not modeled.)
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from terrafix.components.fields import ACQUISITION, RADAR_LABELS, RADAR_UNITS
-from terrafix.components.truth.terrain import GRID, HEIGHT, SURFACE, dem_from, scene_from
-from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.components.fields import ACQUISITION, ECHO, GRID, HEIGHT, RADAR, SURFACE
+from terrafix.components.sensors.files import (
+    file_of_step,
+    read_lines,
+    recorded_files,
+    require_files,
+)
+from terrafix.components.shared import common, generator
+from terrafix.components.truth.terrain import dem_from, scene_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.basics.machine import require_memory
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Count, FilePath, Parameter, Text
 from terrafix.cosim.declare.ports import Input, MessageOutput, SharedInput, SharedOutput
+from terrafix.models.core.arrays import ComplexArray
 from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.radar.boresight import Boresight, boresight_on_terrain
-from terrafix.models.radar.chirp import ComplexArray, Radar
+from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.echo import Acquisition, simulated_echo
-from terrafix.models.radar.recording import RecordedLines, read_recording
+from terrafix.models.radar.recording import RecordedLines
 
-RADAR: dict[str, Any] = {"shape": (6,), "unit": RADAR_UNITS, "labels": RADAR_LABELS}
-ECHO: dict[str, Any] = {"shape": (None, None), "dtype": np.complex64}
 _BEYOND = 5.0
 """Arc beyond all apertures [s]: the corners of the surface that is looked up are seen that late."""
 
@@ -211,80 +215,3 @@ class RecordedEcho(_Echo):
         near = float(common(self, "range0"))
         near += (lines.first_cell - 1) * self._radar().range_spacing
         self._publish(t, lines.echo, self._first_time(lines), near)
-
-
-def common(component: Component, name: str) -> FloatArray:
-    """What is the same for all active members."""
-    values = np.asarray(getattr(component, name))[component.environment.active]
-    if len(values) > 1 and np.any(values != values[:1]):
-        raise ConfigurationError(
-            f"'{component.name}.{name}' differs between members, but its output is one for all\n"
-            "  fly members with one truth: disperse what is known at the start and the sensors, "
-            "not the orbit, the attitude or the antenna; or fly one member at a time"
-        )
-    return np.asarray(values[0])
-
-
-def generator(component: Component) -> np.random.Generator:
-    """Noise of a step, one for all members: of the root seed, the component and its step alone."""
-    env = component.environment
-    words = [env.seed & 0xFFFFFFFF, env.seed >> 32, component.step_index, *env.path.encode()]
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
-
-
-def read_lines(component: Component, path: Path) -> RecordedLines:
-    """Recorded lines in a file of a component."""
-    try:
-        return read_recording(path)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(
-            f"'{component.name}' cannot read its echo: {error}\n"
-            f"  set {component.name}.folder and {component.name}.files, or TERRAFIX_DATA to the "
-            "folder with the data"
-        ) from error
-
-
-def require_files(component: Component, duration: float) -> list[tuple[float, Path]]:
-    """Time and file of every step within a run; ConfigurationError if there are too few."""
-    times, paths = steps_within(component.rate, duration), recorded_files(component)
-    if len(times) > len(paths):
-        raise ConfigurationError(
-            f"'{component.name}' steps {len(times)} times within {duration:g} s, but has "
-            f"{len(paths)} file{'s' if len(paths) != 1 else ''}\n"
-            f"  name one for each step in {component.name}.files, or list fewer times"
-        )
-    return list(zip(times, paths, strict=False))
-
-
-def file_of_step(component: Component) -> Path:
-    """File of the step that is being taken."""
-    paths = recorded_files(component)
-    if component.step_index > len(paths):
-        raise ConfigurationError(
-            f"'{component.name}' has no file for its step {component.step_index}\n"
-            f"  name one for each step in {component.name}.files"
-        )
-    return paths[component.step_index - 1]
-
-
-def recorded_files(component: Component) -> list[Path]:
-    """Files of a component with the parameters `folder` and `files`."""
-    folder: Path = component.setting("folder")
-    names = component.setting("files").replace(",", " ").split()
-    if not names:
-        raise ConfigurationError(
-            f"'{component.name}' has no file\n  name one for each step in {component.name}.files"
-        )
-    return [folder / name for name in names]
-
-
-def steps_within(rate: Rate | None, duration: float) -> list[float]:
-    """Times of the steps after t = 0 within a run [s]."""
-    if rate is None:
-        return []
-    if rate.times is not None:
-        return [float(t) for t in rate.times if 0 < t <= duration]
-    assert rate.period is not None
-    first = float(rate.offset) or float(rate.period)
-    n = int((duration - first) / float(rate.period) + 1e-9) + 1 if duration >= first else 0
-    return [first + k * float(rate.period) for k in range(n)]

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafix.components.fields import GRID_LABELS, GRID_UNITS
+from terrafix.components.fields import GRID, HEIGHT, SURFACE
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import SharedOutput
+from terrafix.models.core.arrays import Single
 from terrafix.models.maps.dem import Dem, flat_dem, read_dem, read_jacksboro
 from terrafix.models.radar.scene import Scene
 
 SOURCES = ("file", "jacksboro", "flat")
-HEIGHT: dict[str, Any] = {"shape": (None, None), "unit": "m", "dtype": np.float32}
-GRID: dict[str, Any] = {"shape": (5,), "unit": GRID_UNITS, "labels": GRID_LABELS}
-SURFACE: dict[str, Any] = {"shape": (6,)}
-"""Ports of a terrain and of those who read them."""
 
 
 class Terrain(Component):
@@ -107,13 +101,13 @@ class Terrain(Component):
         """Say nothing more."""
 
 
-def dem_from(height: NDArray[np.float32], grid: FloatArray) -> Dem:
+def dem_from(height: Single, grid: FloatArray) -> Dem:
     """Elevation model of the ports of a terrain, without copying it."""
     south, west, north, east, mirrored = (float(g) for g in grid)
     return Dem(height, south, west, north, east, mirrored=bool(mirrored))
 
 
-def scene_from(height: NDArray[np.float32], grid: FloatArray, surface: FloatArray) -> Scene:
+def scene_from(height: Single, grid: FloatArray, surface: FloatArray) -> Scene:
     """What the ground looks like to a radar, from the ports of a terrain."""
     seed, *strengths = (float(s) for s in surface)
     return Scene(dem_from(height, grid), int(seed), *strengths)

@@ -19,6 +19,8 @@ from terrafix.cosim.basics.errors import RateError
 
 Exact = int | str | Fraction | Decimal
 """What is accepted as an exact number of seconds or hertz."""
+MOST_TIMES = 8
+"""Times that a repr lists."""
 
 _SECONDS: dict[str, int | Fraction] = {
     "": 1,
@@ -129,7 +131,7 @@ def rational_gcd(values: Iterable[Fraction]) -> Fraction:
     return Fraction(numerator, denominator)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Rate:
     """When a component steps: a period with an offset, or a list of times.
 
@@ -254,6 +256,24 @@ class Rate:
         grid = grid or base
         ticks_per_point = int(grid / base)
         return [math.ceil(time / grid) * ticks_per_point for time in self.times]
+
+    def __repr__(self) -> str:
+        """The call that makes it; a long list of times is cut, with their count after it."""
+        if self.times is None:
+            assert self.period is not None
+            offset = f', offset="{text_seconds(self.offset)} s"' if self.offset else ""
+            return f'Rate("{text_seconds(self.period)} s"{offset})'
+        listed = [f'"{text_seconds(t)} s"' for t in self.times]
+        if len(listed) <= MOST_TIMES:
+            return f"Rate(times=[{', '.join(listed)}])"
+        cut = ", ".join([*listed[: MOST_TIMES // 2], "...", listed[-1]])
+        return f"Rate(times=[{cut}])  # {len(listed)} times"
+
+    def identity(self) -> str:
+        """All of it, as `str` but with every listed time: equal for equal rates alone."""
+        if self.times is None:
+            return str(self)
+        return f"at {', '.join(map(text_seconds, self.times))} s"
 
     def __str__(self) -> str:
         if self.times is not None:

@@ -1,6 +1,8 @@
 """Units of ports and parameters: compared by dimension, converted or refused before the run.
 
-A thin door to Pint, loaded on first need: equal unit texts never need it.
+A thin door to Pint, loaded on first need: equal unit texts never need it. Angle is a dimension
+here, so that a rotation is not taken for a frequency: 1 Hz of a wheel is 6.28 rad/s, of a filter's
+pole 1/s. Elsewhere the radian alone may be left out: rad is 1, N m/rad is N m.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 from functools import lru_cache
+from importlib import resources
 from typing import Any
 
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -19,14 +22,24 @@ DIMENSIONLESS = ("", "1")
 def _registry() -> Any:
     import pint
 
-    registry: Any = pint.UnitRegistry()
+    folder = resources.files("pint")
+    units, constants = (
+        (folder / f"{name}_en.txt").read_text(encoding="utf-8") for name in ("default", "constants")
+    )
+    units = units.replace("@import constants_en.txt", constants)
+    registry: Any = pint.UnitRegistry(None)
+    registry.load_definitions(units.replace("radian = []", "radian = [angle]").splitlines())
+    assert registry.Unit("radian").dimensionality, "Pint defines the radian otherwise than it did"
     registry.define("px = pixel")  # of an image; Pint's own px is a length, 1/96 inch
     return registry
 
 
+_ROOT = re.compile(r"\bsqrt\(([^()]*)\)")
+
+
 @lru_cache(maxsize=1024)
 def _unit(text: str) -> Any:
-    name = "dimensionless" if text in DIMENSIONLESS else text
+    name = "dimensionless" if text in DIMENSIONLESS else _ROOT.sub(r"(\1)^0.5", text)
     try:
         return _registry().Unit(name)
     except Exception as error:  # pint raises many types for text it cannot read
@@ -47,15 +60,54 @@ def conversion_factor(source: str, target: str) -> float | None:
     if source == target or (source in DIMENSIONLESS and target in DIMENSIONLESS):
         return 1.0
     a, b = _unit(source), _unit(target)
-    if a.dimensionality != b.dimensionality:
-        return None
     registry = _registry()
+    if a.dimensionality != b.dimensionality:
+        if not _differ_by_angle(a, b) or _is_rate(a, b):
+            return None
+        a, b = (_without_radians(unit) for unit in (a, b))
+        if a.dimensionality != b.dimensionality:  # degrees or turns: a number of what?
+            return None
     zero = registry.Quantity(0.0, a).to(b).magnitude
     if zero != 0.0:
         raise ConfigurationError(
             f"'{source}' to '{target}' is not a pure factor; use an absolute unit such as kelvin"
         )
     return float(registry.Quantity(1.0, a).to(b).magnitude)
+
+
+def _differ_by_angle(a: Any, b: Any) -> bool:
+    return set((a / b).dimensionality) == {"[angle]"}
+
+
+def _is_rate(a: Any, b: Any) -> bool:
+    """Whether one of two units is a rotation rate where the other is a frequency."""
+    return {"[time]"} == {*a.dimensionality, *b.dimensionality} - {"[angle]"}
+
+
+def _without_radians(unit: Any) -> Any:
+    powers = dict(_registry().Quantity(1.0, unit).unit_items())
+    return unit / _registry().Unit("radian") ** powers.get("radian", 0)
+
+
+def difference(source: str, target: str) -> str:
+    """Say that two units differ in dimension, and where a mistake is common, the way out."""
+    text = f"the units differ: {source} is not {target}"
+    a, b = _unit(source), _unit(target)
+    if _differ_by_angle(a, b):
+        if _is_rate(a, b):
+            return (
+                f"{text}\n  a rotation (rad/s, deg/h, rpm) and a frequency (Hz, 1/s) are not one "
+                "dimension:\n  a turn is 2 pi rad; write both sides as rad/s, or both as Hz"
+            )
+        return f"{text}\n  an angle becomes a plain number in radians alone: write it in rad"
+    for word in re.findall(r"[a-zA-Z]*g\b", source):
+        corrected = re.sub(rf"\b{word}\b", f"{word}_0", source)
+        try:
+            if _unit(corrected).dimensionality == b.dimensionality:
+                return f"{text}\n  g is gram; for standard gravity write {corrected}"
+        except ConfigurationError:
+            continue
+    return text
 
 
 def check_unit(text: str) -> None:
@@ -121,13 +173,13 @@ def base_units(text: str) -> tuple[float, dict[str, int]] | None:
     """
     unit = _unit(text)
     factor, exponents = 1.0, dict[str, int]()
-    for name, power in unit._units.items():
+    for name, power in _registry().Quantity(1.0, unit).unit_items():
         if name == "radian":
             reduced = {"radian": 1.0}
         else:
             quantity = _registry().Quantity(1.0, name).to_root_units()
             factor *= float(quantity.magnitude) ** power
-            reduced = dict(quantity.units._units)
+            reduced = dict(quantity.unit_items())
             if not reduced and name in ("degree", "arcminute", "arcsecond", "milliradian"):
                 reduced = {"radian": 1.0}
         for base, each in reduced.items():

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.cosim.basics.errors import ConfigurationError, StepError
-from terrafix.cosim.campaign.statistics import BLOCK, Block, Layout, block_of
+from terrafix.cosim.campaign.statistics.ensemble import STATISTICS, block_of
+from terrafix.cosim.campaign.statistics.statistic import BLOCK, Layout, Statistic, Sums
 from terrafix.cosim.declare.evaluation import Evaluation
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.system import System
@@ -58,6 +59,8 @@ class Task:
         [s]
     histories : str or None
         Folder for full records, one NetCDF file per block.
+    kinds : tuple of Statistic
+        What is summed up; `STATISTICS` if absent.
     key : str
         Unlike that of any other campaign.
     """
@@ -67,6 +70,7 @@ class Task:
     seed: int
     duration: Fraction
     histories: str | None = None
+    kinds: tuple[Statistic, ...] = field(default_factory=lambda: tuple(STATISTICS))
     key: str = field(default_factory=lambda: uuid4().hex)
 
 
@@ -77,7 +81,7 @@ class BlockResult:
     Attributes
     ----------
     number : int
-    sums : dict of str to Block
+    sums : dict of str to (dict of str to ndarray)
         By evaluation component.
     parameters : dict of str to ndarray
         Dispersed parameters as they reached the components, (n_members, ...).
@@ -87,7 +91,7 @@ class BlockResult:
     """
 
     number: int
-    sums: dict[str, Block]
+    sums: dict[str, Sums]
     parameters: dict[str, NDArray[Any]]
     excluded: list[dict[str, Any]]
     kernel: str
@@ -248,7 +252,7 @@ def _blocks(
         sums = {}
         for path, layout in found.items():
             cut = {name: np.ascontiguousarray(a[:, part]) for name, a in histories[path].items()}
-            sums[path] = block_of(layout, cut, first=first)
+            sums[path] = block_of(layout, cut, first=first, kinds=task.kinds)
         mine = set(members[part].tolist())
         results.append(
             BlockResult(

@@ -1,6 +1,6 @@
 """One call from a system to the statistics of many members, and the verdict.
 
-result = run_campaign(FileSource("system.toml"), runs=100)
+result = run_campaign("system.toml", runs=100)
 print(result.verdicts["evaluation"].text)
 """
 
@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,8 @@ from terrafix.cosim.campaign.batch import (
     members_per_batch,
 )
 from terrafix.cosim.campaign.results import CampaignResult
-from terrafix.cosim.campaign.statistics import BLOCK, Statistics
+from terrafix.cosim.campaign.statistics.ensemble import STANDARD, STATISTICS, Statistics
+from terrafix.cosim.campaign.statistics.statistic import BLOCK
 from terrafix.cosim.campaign.store import RESULT, SUMMARY, Store
 from terrafix.cosim.campaign.verdict import judge
 from terrafix.cosim.engine.simulation import MAX_MEMBER, Simulation
@@ -41,9 +41,10 @@ class CampaignError(StepError):
 
 
 def run_campaign(
-    source: FileSource | System,
+    source: System | FileSource | str | Path,
     *,
     runs: int,
+    settings: Sequence[tuple[str, str]] = (),
     seed: int | None = None,
     duration: Exact | None = None,
     workers: int | None = None,
@@ -59,10 +60,13 @@ def run_campaign(
 
     Parameters
     ----------
-    source : FileSource or System
-        A system needs components that can be pickled where several processes fly it.
+    source : System, FileSource or path
+        A path is that of a system file, which each process reads for itself; a system needs
+        components that can be pickled where several processes fly it.
     runs : int
         Members.
+    settings : sequence of (str, str)
+        ``("orbit.gravity", "j2")``, applied to the file, after those of a `FileSource`.
     seed : int, optional
         Root seed; the system's own if absent.
     duration : exact time, optional
@@ -94,13 +98,13 @@ def run_campaign(
     """
     began = time.perf_counter()
     _check_numbers(runs, workers, batch, resume=resume, out=out, histories=histories)
-    if isinstance(source, FileSource):  # workers may stand elsewhere
-        source = replace(source, path=str(Path(source.path).absolute()))
+    source = _source(source, settings)
     system = source.read() if isinstance(source, FileSource) else source
     length = system.duration if duration is None else seconds(duration, "duration")
     if length is None or length <= 0:
         raise RateError(f"system '{system.name}' has no duration; give one, such as '600 s'")
     root = system.seed if seed is None else seed
+    kinds = tuple(STATISTICS)
     simulation = Simulation(
         system, members=[0], seed=root, duration=length, runs=runs, recording=False
     )
@@ -113,7 +117,7 @@ def run_campaign(
             runs=runs,
             duration=length,
             configuration=configuration(simulation.plan),
-            statistics={path: Statistics(layout) for path, layout in found.items()},
+            statistics={path: Statistics(layout, kinds) for path, layout in found.items()},
             workers="",
             setup_s=0.0,
             source=_described(source),
@@ -127,9 +131,8 @@ def run_campaign(
         result.out = Path(out)
         store = Store(result.out, _identity(result, histories=histories), resume=resume)
     try:
-        task = Task(
-            source, runs, root, length, str(Path(out) / "histories") if out and histories else None
-        )
+        kept = str(Path(out) / "histories") if out and histories else None
+        task = Task(source, runs, root, length, kept, kinds)
         result.setup_s = time.perf_counter() - began
         _fly(result, task, store, size, workers, dask, progress, started)
         result.verdicts = {path: judge(s) for path, s in result.statistics.items()}
@@ -165,6 +168,27 @@ def _check_numbers(
         raise ConfigurationError(f"to {what}, say where its folder is\n  give --out DIR")
 
 
+def _source(
+    source: System | FileSource | str | Path, settings: Sequence[tuple[str, str]]
+) -> System | FileSource:
+    """What workers are given; a path is absolute, for they may stand elsewhere."""
+    if isinstance(source, System):
+        if settings:
+            raise ConfigurationError(
+                f"system '{source.name}' is built already, so settings cannot be applied\n"
+                "  give the path of its file, or set the parameters of its components"
+            )
+        return source
+    if isinstance(source, str | Path):
+        source = FileSource(str(source))
+    if not isinstance(source, FileSource):
+        raise ConfigurationError(
+            f"a campaign flies a system or the path of its file, not {type(source).__name__}"
+        )
+    more = tuple((name, value) for name, value in settings)
+    return FileSource(str(Path(source.path).absolute()), source.settings + more)
+
+
 def _described(source: FileSource | System) -> dict[str, Any]:
     """Where the system was read from, for reports that read it again."""
     if isinstance(source, System):
@@ -174,20 +198,17 @@ def _described(source: FileSource | System) -> dict[str, Any]:
 
 def _drawn(system: System) -> str:
     """The system's diagram as SVG."""
-    from tempfile import TemporaryDirectory
+    from terrafix.cosim.system.graph import Diagram
 
-    from terrafix.cosim.system.graph import draw
-
-    with TemporaryDirectory(prefix="terrafix-") as folder:
-        file = Path(folder, "graph.svg")
-        draw(system, file)
-        text = file.read_text()
+    text = Diagram(system).svg()
     return text[text.index("<svg") :]
 
 
 def _identity(result: CampaignResult, *, histories: bool) -> dict[str, Any]:
     from terrafix.cosim.records.results import versions
 
+    kept = next(iter(result.statistics.values())).kinds
+    added = [type(kind).__qualname__ for kind in kept if kind not in STANDARD]
     plain: dict[str, Any] = json.loads(
         json.dumps(
             {
@@ -198,7 +219,8 @@ def _identity(result: CampaignResult, *, histories: bool) -> dict[str, Any]:
                 "histories": histories,
                 "configuration": result.configuration,
                 "versions": versions(),
-            },
+            }
+            | ({"statistics": added} if added else {}),
             default=str,
         )
     )

@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
+import io
 import shlex
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 from rich import box
+from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from terrafix.cosim.campaign.outcome import Outcome
+from terrafix.cosim.campaign.statistics.ensemble import facts_of
+from terrafix.cosim.campaign.statistics.moments import EndRow, end_rows
 from terrafix.cosim.campaign.verdict import Verdict
 from terrafix.cosim.show.numbers import number, shown_unit
 
-if TYPE_CHECKING:
-    from terrafix.cosim.campaign.results import CampaignResult
-
 _STYLES = {"consistent": "bold green", "undecided": "bold yellow"}
 NAMED = 5
+WIDTH, ROWS, EVALUATIONS = 100, 15, 3
+"""Of what is shown at a prompt: characters, rows of tables, evaluation components."""
 
 
-def campaign_tables(result: CampaignResult, system: str) -> list[Any]:
+def campaign_tables(result: Outcome, system: str) -> list[Any]:
     """What a person wants to know of a campaign, as rich renderables in the order of reading."""
+    shown = overview(result)
+    repeat = f"terrafix campaign {shlex.quote(system)} --runs {result.runs} --seed {result.seed}"
+    shown.append(Text(f"repeat any run alone: {repeat} --member K --out member.nc", style="dim"))
+    if result.out is not None:
+        shown.append(Text(f"wrote {result.out}; terrafix report {result.out}", style="dim"))
+    return shown
+
+
+def overview(result: Outcome, *, brief: bool = False) -> list[Any]:
+    """The same without what to do next; on one screen, if `brief`."""
     header = Text(f"{result.system}: {result.runs} runs", style="bold")
     facts = [
         f"{result.wall_s:.2f} s (set up in {result.setup_s:.2f} s)",
@@ -32,23 +46,42 @@ def campaign_tables(result: CampaignResult, system: str) -> list[Any]:
     ]
     header.append(f", {', '.join(facts)}", style="not bold")
     shown: list[Any] = [header]
-    summary = result.summary()["evaluation"]
-    each = summary if len(result.statistics) > 1 else dict.fromkeys(result.statistics, summary)
-    for path, evaluation in each.items():
-        if len(result.statistics) > 1:
+    several = len(result.statistics)
+    n_shown = min(several, EVALUATIONS) if brief else several
+    for path, statistics in list(result.statistics.items())[:n_shown]:
+        if several > 1:
             shown.append(Text(f"\n{path}", style="bold"))
-        shown.append(_table(evaluation))
-        shown += [Text(line) for line in _lines(evaluation)]
-        shown.append(_verdict(result.verdicts[path]))
-    shown += [Text(line) for line in _failures(result)]
-    repeat = f"terrafix campaign {shlex.quote(system)} --runs {result.runs} --seed {result.seed}"
-    shown.append(Text(f"repeat any run alone: {repeat} --member K --out member.nc", style="dim"))
-    if result.out is not None:
-        shown.append(Text(f"wrote {result.out}; terrafix report {result.out}", style="dim"))
-    return shown
+        summary = statistics.summary()
+        shown.append(_table(list(end_rows(summary)), ROWS // n_shown if brief else None))
+        shown += [Text(line) for line in _aligned(facts_of(summary, statistics.present))]
+        if path in result.verdicts:
+            shown.append(_verdict(result.verdicts[path]))
+    rest = [f"{path} ({verdict.text})" for path, verdict in result.verdicts.items()][n_shown:]
+    if rest:
+        shown.append(Text(f"\nand {', '.join(rest)}"))
+    return shown + [Text(line) for line in _failures(result, NAMED if brief else None)]
 
 
-def _table(evaluation: Mapping[str, Any]) -> Padding:
+def as_text(result: Outcome) -> str:
+    """A screen of plain text."""
+    return _console(result).export_text().rstrip()
+
+
+def as_html(result: Outcome) -> str:
+    """The same for a notebook."""
+    frame = '<pre style="line-height: 1.3">{code}</pre>'
+    return _console(result).export_html(inline_styles=True, code_format=frame)
+
+
+def _console(result: Outcome) -> Console:
+    console = Console(
+        file=io.StringIO(), record=True, width=WIDTH, force_jupyter=False, legacy_windows=False
+    )
+    console.print(*overview(result, brief=True), sep="\n")
+    return console
+
+
+def _table(found: list[EndRow], rows: int | None) -> Padding:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for column in ("at the end", "axis", "unit"):
         table.add_column(column)
@@ -61,58 +94,43 @@ def _table(evaluation: Mapping[str, Any]) -> Padding:
         "in (95 %)",
     ):
         table.add_column(column, justify="right")
-    for name, q in evaluation.items():
-        if not isinstance(q, Mapping) or "sigma_sample" not in q:
-            continue
-        unit, factor = shown_unit(q["unit"])
-        for i, axis in enumerate(q["axes"]):
-            low, high = q["ratio_interval_95"][i]
-            values = [
-                q[k][i] for k in ("mean_error", "standard_error", "sigma_sample", "sigma_predicted")
-            ]
-            table.add_row(
-                name if i == 0 else "",
-                axis,
-                unit if i == 0 else "",
-                *(number(None if v is None else v * factor) for v in values),
-                number(q["ratio"][i], 3),
-                f"{low:.2f}-{high:.2f}" if low is not None else "-",
-            )
+    for row in found[:rows]:
+        unit, factor = shown_unit(row.unit)
+        values = (row.mean_error, row.standard_error, row.sigma_sample, row.sigma_predicted)
+        table.add_row(
+            row.quantity if row.first else "",
+            row.axis,
+            unit if row.first else "",
+            *(number(None if v is None else v * factor) for v in values),
+            number(row.ratio, 3),
+            "-" if row.interval is None else "{:.2f}-{:.2f}".format(*row.interval),
+        )
+    if len(found[:rows]) < len(found):
+        table.add_row(f"and {len(found) - len(found[:rows])} more")
     return Padding(table, (1, 0))
 
 
-def _lines(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    for name in ("nees", "nis"):
-        c = evaluation.get(name)
-        if c and c["mean"] is not None:
-            low, high = c["interval_95"]
-            yield (
-                f"{name.upper():5} {number(c['mean'])} on average, expected {number(c['dof'])}, "
-                f"95 % interval {number(low)} to {number(high)}; "
-                f"{c['fraction_inside']:.0%} of the epochs inside theirs"
-            )
-    white = evaluation.get("whiteness")
-    if white:
-        values = ", ".join(number(v, 2) for v in white["correlation"])
-        yield f"correlation of successive innovations {values}"
+def _aligned(facts: Iterable[tuple[str, str]]) -> list[str]:
+    pairs = list(facts)
+    width = max((len(term) for term, _ in pairs), default=0)
+    return [f"{term:{width}}  {text}" for term, text in pairs]
 
 
 def _verdict(verdict: Verdict) -> Text:
-    style = _STYLES.get(verdict.words[0], "bold red")
     text = Text("verdict: ")
-    text.append(verdict.text, style=style)
+    text.append(verdict.text, style=_STYLES.get(verdict.words[0], "bold red"))
     if not verdict.findings:
-        text.append(f" ({verdict.tests} tests at a level of 1 % in all)")
-    for finding in verdict.findings:
-        text.append(f"\n  {finding.word}: {finding.text}")
-    return text
+        return text.append(f" ({verdict.reasons[0]})")
+    return text.append("".join(f"\n  {reason}" for reason in verdict.reasons))
 
 
-def _failures(result: CampaignResult) -> Iterator[str]:
+def _failures(result: Outcome, most: int | None) -> Iterator[str]:
     if not result.n_excluded:
         return
     yield f"{result.n_excluded} of {result.runs} members failed and are left out from then on:"
-    for reason, count in result.reasons.items():
+    for reason, count in list(result.reasons.items())[:most]:
         members = [str(e["member"]) for e in result.excluded if e["reason"] == reason]
         more = ", ..." if len(members) > NAMED else ""
         yield f"  {count}: {reason} (members {', '.join(members[:NAMED])}{more})"
+    if most is not None and len(result.reasons) > most:
+        yield f"  and {len(result.reasons) - most} other reasons"

@@ -17,6 +17,7 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from importlib import import_module
+from multiprocessing.context import SpawnContext, SpawnProcess
 from types import ModuleType
 from typing import Any
 
@@ -50,7 +51,7 @@ def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown
     lost: dict[Batch, int] = {}
     alone = b"__main__" not in pickle.dumps(task)
     while waiting:
-        context = multiprocessing.get_context("spawn")
+        context = _Spawning()
         pool = ProcessPoolExecutor(workers, context, initializer=_begin_worker)
         running: dict[Any, Batch] = {}
         try:
@@ -69,8 +70,23 @@ def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown
             waiting += again[::-1]
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in list((pool._processes or {}).values()):
-                process.terminate()
+            for process in context.started:
+                if process.is_alive():
+                    process.terminate()
+
+
+class _Spawning(SpawnContext):
+    """Starts processes, and remembers them, so that they can be ended before they are done."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.started: list[SpawnProcess] = []
+
+    def Process(self, *args: Any, **options: Any) -> SpawnProcess:  # type: ignore[override]
+        """Make a process."""
+        made = SpawnProcess(*args, **options)
+        self.started.append(made)
+        return made
 
 
 @contextmanager

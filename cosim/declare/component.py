@@ -13,10 +13,11 @@ A component reaches for nothing but its own ports, parameters, states and `norma
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,10 +26,13 @@ from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, RateError, WiringError, nearest
 from terrafix.cosim.basics.noise import NormalBlocks, NormalStream
-from terrafix.cosim.declare.parameters import Parameter, Setting
+from terrafix.cosim.declare.parameters import Choice, Flag, Parameter, Setting, shown
 from terrafix.cosim.declare.ports import Capabilities, Declaration, Port, State
+from terrafix.cosim.show.tables import Block, Shown
 
-ATTRIBUTES = frozenset({"name", "rate", "ports", "step_index", "kernel"})  # of every component
+ATTRIBUTES = frozenset(
+    {"name", "rate", "ports", "step_index", "kernel", "call", "messages"}
+)  # of every component
 KEYS = frozenset({"type", "period", "offset", "times", "doc"})  # of its table in a file
 
 
@@ -40,15 +44,68 @@ def _own(base: type) -> bool:
     )
 
 
-@dataclass(frozen=True)
-class PortRef:
-    """A port of one component, as written ``imu["delta_v"]``."""
+class Owner(Protocol):
+    """What has ports: a component, or a system that exposes some."""
 
-    component: Any
+    name: str
+
+
+@dataclass(frozen=True, repr=False)
+class PortRef:
+    """A port of one component, as written ``imu["delta_v"]``, and its declaration."""
+
+    component: Owner
     port: str
+    declared: Port[object]
 
     def __str__(self) -> str:
         return f"{self.component.name or '(unnamed)'}.{self.port}"
+
+    def __repr__(self) -> str:
+        return f"<{self}: {self.declared!r}>"
+
+
+class _Documentation:
+    """Docstring of a component type: as it was written, then its parameters and ports.
+
+    Made when somebody asks for it; ``vars(kind)["__doc__"].written`` is the text alone.
+    """
+
+    def __init__(self, written: str | None) -> None:
+        self.written = written
+
+    def __get__(self, obj: object, owner: type[Component]) -> str:
+        from terrafix.cosim.declare.display import help_text
+
+        doc = next(filter(None, (docstring(k) for k in owner.__mro__ if k is not Component)), "")
+        ports = {n: d for n, d in owner._declared.items() if isinstance(d, Port)}
+        return help_text(doc, owner.default_rate, owner.settings(), ports)
+
+
+def docstring(kind: type) -> str:
+    """The docstring of a class as it was written there, without what `help` adds to it."""
+    found = vars(kind).get("__doc__")
+    return inspect.cleandoc(getattr(found, "written", found) or "")
+
+
+class _CallTip:
+    """Signature of a component type: its parameters are keyword arguments."""
+
+    def __get__(self, obj: object, owner: type[Component]) -> inspect.Signature:
+        if owner is Component or owner.__init__ is not Component.__init__:
+            raise AttributeError("__signature__")  # it has one of its own
+        only = inspect.Parameter.KEYWORD_ONLY
+        listed = [
+            inspect.Parameter(
+                name,
+                only,
+                default=inspect.Parameter.empty if setting.required else setting.default,
+                annotation=setting.kind(),
+            )
+            for name, setting in owner.settings().items()
+        ]
+        rate = inspect.Parameter("rate", only, default=owner.default_rate, annotation="Rate")
+        return inspect.Signature([*listed, rate])
 
 
 @dataclass
@@ -84,7 +141,7 @@ class Environment:
         return len(self.members)
 
 
-class Component:
+class Component(Shown):
     """Base of every component.
 
     Parameters
@@ -103,6 +160,7 @@ class Component:
     capabilities: ClassVar[Capabilities] = Capabilities()
     default_rate: ClassVar[Rate | None] = None
     _declared: ClassVar[dict[str, Declaration]] = {}
+    __signature__ = _CallTip()
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -120,8 +178,9 @@ class Component:
         if clash:
             raise TypeError(f"{cls.__name__} declares reserved names {sorted(clash)}")
         cls._declared = declared
+        cls.__doc__ = _Documentation(vars(cls).get("__doc__"))  # type: ignore[assignment]
 
-    def __init__(self, *, rate: Rate | None = None, **settings: Any) -> None:
+    def __init__(self, *, rate: Rate | None = None, **settings: object) -> None:
         self.name = ""
         self.rate = rate or self.default_rate
         if self.rate is not None and not isinstance(self.rate, Rate):
@@ -129,7 +188,7 @@ class Component:
                 f"the rate of a {type(self).__name__} is {self.rate!r}\n"
                 '  write Rate("0.01") for a period, or Rate(hz=100)'
             )
-        self.ports: dict[str, Port[Any]] = {}
+        self.ports: dict[str, Port[object]] = {}
         self._views: dict[str, Any] = {}
         self._states: dict[str, NDArray[Any]] = {}
         self._settings: dict[str, Any] = {}
@@ -158,7 +217,7 @@ class Component:
     # ------------------------------------------------------------------ settings and ports
 
     @classmethod
-    def settings(cls) -> dict[str, Setting[Any]]:
+    def settings(cls) -> dict[str, Setting[object]]:
         """Declared parameters by name."""
         return {n: d for n, d in cls._declared.items() if isinstance(d, Setting)}
 
@@ -175,6 +234,30 @@ class Component:
     def setting(self, name: str) -> Any:
         """The value that was set (for numeric parameters: before dispersions, without members)."""
         return self._base[name]
+
+    def is_default(self, name: str) -> bool:
+        """Whether a parameter stands as its declaration has it."""
+        declared = self.settings()[name]
+        if declared.required or name not in self._base:
+            return name not in self._base
+        default = declared.read(declared.default, where=f"default of '{name}'")
+        return bool(np.all(np.asarray(self._base[name] == default)))
+
+    def takes(self, name: str) -> bool:
+        """Whether a parameter has any effect, as the others are now; override where it may not."""
+        return name in self.settings()
+
+    def idle(self, name: str) -> str | None:
+        """Why a parameter would change nothing, in words; None if it has an effect."""
+        if self.missing_settings() or self.takes(name):
+            return None
+        chosen = [
+            f"{n} = {shown(self.setting(n))}"
+            for n, s in self.settings().items()
+            if isinstance(s, Choice | Flag)
+        ]
+        with_these = f" with {', '.join(chosen)}" if chosen else ""
+        return f"'{self.name}' does not take '{name}'{with_these}: it would change nothing"
 
     def missing_settings(self) -> list[str]:
         """Names of required parameters that were not given."""
@@ -193,13 +276,25 @@ class Component:
                 f"'{self.name or type(self).__name__}' has no port '{port}'\n"
                 f"  {nearest(port, self.ports, what='its ports')}"
             )
-        return PortRef(self, port)
+        return PortRef(self, port, self.ports[port])
 
-    def inputs(self) -> dict[str, Port[Any]]:
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self.ports)
+
+    def __dir__(self) -> Iterable[str]:
+        return sorted({*super().__dir__(), *self.ports})
+
+    def _shown(self) -> list[Block]:
+        from terrafix.cosim.declare.display import component_shown
+
+        title = type(self).__name__ + (f" '{self.name}'" if self.name else "")
+        return component_shown(title, self.rate, self.settings(), self._base, self.ports)
+
+    def inputs(self) -> dict[str, Port[object]]:
         """Input ports by name."""
         return {n: p for n, p in self.ports.items() if p.is_input}
 
-    def outputs(self) -> dict[str, Port[Any]]:
+    def outputs(self) -> dict[str, Port[object]]:
         """Output ports by name."""
         return {n: p for n, p in self.ports.items() if not p.is_input}
 

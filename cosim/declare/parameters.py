@@ -17,15 +17,15 @@ from pathlib import Path
 from typing import Any, Generic, Self, TypeVar, overload
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
-from terrafix.cosim.basics.units import conversion_factor, split_quantity
-from terrafix.cosim.declare.ports import Declaration
-from terrafix.cosim.memory.fields import Unit
+from terrafix.cosim.basics.units import conversion_factor, difference, split_quantity
+from terrafix.cosim.declare.ports import Declaration, written
+from terrafix.cosim.memory.fields import Unit, quoted
 
-Value = TypeVar("Value")
+Value_co = TypeVar("Value_co", covariant=True)
 REQUIRED: Any = object()
 MOST_SHOWN = 9  # numbers in an error message
 
@@ -39,10 +39,10 @@ def shown(value: object) -> str:
     return repr(value)
 
 
-class Setting(Declaration, Generic[Value]):
+class Setting(Declaration, Generic[Value_co]):
     """Base of everything that can be set on a component by name."""
 
-    def __init__(self, default: Any = REQUIRED, *, doc: str = "") -> None:
+    def __init__(self, default: object = REQUIRED, *, doc: str = "") -> None:
         self.default = default
         self.doc = doc
 
@@ -51,7 +51,7 @@ class Setting(Declaration, Generic[Value]):
         """Whether a value must be given."""
         return self.default is REQUIRED
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> Value:
+    def read(self, value: object, *, where: str, bare: bool = True) -> Value_co:
         """Turn what a person wrote into the value; `where` names it in errors.
 
         `bare` allows a number without a unit, taken in the declared unit.
@@ -62,18 +62,24 @@ class Setting(Declaration, Generic[Value]):
         """Describe what is accepted, for listings."""
         return type(self).__name__.lower()
 
-    def write(self, value: Value) -> Any:
+    def _arguments(self) -> list[str]:
+        return [] if self.required or self.default in (None, {}) else [written(self.default)]
+
+    def write(self, value: Any) -> Any:
         """Write a value so that `read` accepts it again (TOML types only)."""
         return value
 
     @overload
     def __get__(self, obj: None, owner: type) -> Self: ...
     @overload
-    def __get__(self, obj: object, owner: type) -> Value: ...
-    def __get__(self, obj: object | None, owner: type) -> Self | Value:
+    def __get__(self, obj: object, owner: type) -> Value_co: ...
+    def __get__(self, obj: object | None, owner: type) -> Self | Value_co:
         if obj is None:
             return self
-        return obj._settings[self.name]  # type: ignore[attr-defined, no-any-return]
+        try:
+            return obj._settings[self.name]  # type: ignore[attr-defined, no-any-return]
+        except KeyError:
+            raise self._absent(obj, f"has no value yet: it takes {self.kind()}") from None
 
     def __set__(self, obj: object, value: object) -> None:
         obj._set(self.name, value)  # type: ignore[attr-defined]
@@ -100,7 +106,7 @@ class Parameter(Setting[FloatArray]):
 
     def __init__(
         self,
-        default: Any = REQUIRED,
+        default: ArrayLike = REQUIRED,
         *,
         shape: Sequence[int] = (),
         unit: Unit = "1",
@@ -120,12 +126,22 @@ class Parameter(Setting[FloatArray]):
         """The unit as a person writes it."""
         return self.unit if isinstance(self.unit, str) else "(" + ", ".join(self.unit) + ")"
 
+    def _arguments(self) -> list[str]:
+        given = [] if self.required else [written(self.default)]
+        if self.shape:
+            given.append(f"shape={self.shape}")
+        if self.unit != "1":
+            given.append(f"unit={quoted(self.unit)}")
+        bounds = {"minimum": self.minimum, "maximum": self.maximum}
+        given += [f"{n}={v}" for n, v in bounds.items() if v is not None]
+        return given + [f"{n}=True" for n in ("positive", "infinite") if getattr(self, n)]
+
     def kind(self) -> str:
         """Describe what is accepted, for listings."""
         shape = "number" if not self.shape else f"array {self.shape}"
         return shape if self.unit in ("1", "") else f"{shape} [{self.unit_text()}]"
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> FloatArray:
+    def read(self, value: object, *, where: str, bare: bool = True) -> FloatArray:
         """Turn a number, array, or text with a unit into an array in the declared unit.
 
         Raises
@@ -140,7 +156,7 @@ class Parameter(Setting[FloatArray]):
                 raise ConfigurationError(
                     f"{where} is a table with {sorted(value)}; write {{ value = ..., unit = ... }}"
                 )
-            value, unit = value["value"], value.get("unit")
+            unit, value = value.get("unit"), value["value"]
             if not isinstance(unit, str | None):
                 raise ConfigurationError(f"{where} has the unit {shown(unit)}; write it as text")
         if isinstance(value, str):
@@ -187,7 +203,7 @@ class Parameter(Setting[FloatArray]):
         if factor is None:
             raise ConfigurationError(
                 f"{where} is given in {unit}; it takes {self.kind()}\n"
-                f"  the units differ: {unit} is not {self.unit}"
+                f"  {difference(unit, self.unit)}"
             )
         with np.errstate(over="ignore"):  # infinity is refused below
             return array * factor
@@ -234,7 +250,7 @@ class Count(Setting[int]):
 
     def __init__(
         self,
-        default: Any = REQUIRED,
+        default: int = REQUIRED,
         *,
         minimum: int = 0,
         maximum: int | None = None,
@@ -243,7 +259,7 @@ class Count(Setting[int]):
         super().__init__(default, doc=doc)
         self.minimum, self.maximum = minimum, maximum
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> int:
+    def read(self, value: object, *, where: str, bare: bool = True) -> int:
         """Accept an integer, or text of one."""
         if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d+\s*", value):
             value = int(value)
@@ -260,7 +276,7 @@ class Count(Setting[int]):
 class Flag(Setting[bool]):
     """True or false."""
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> bool:
+    def read(self, value: object, *, where: str, bare: bool = True) -> bool:
         """Accept a boolean, or the text ``true`` or ``false``."""
         if isinstance(value, str) and value.strip().lower() in ("true", "false"):
             return value.strip().lower() == "true"
@@ -272,15 +288,18 @@ class Flag(Setting[bool]):
 class Choice(Setting[str]):
     """One of several names."""
 
-    def __init__(self, options: Sequence[str], default: Any = REQUIRED, *, doc: str = "") -> None:
+    def __init__(self, options: Sequence[str], default: str = REQUIRED, *, doc: str = "") -> None:
         super().__init__(default, doc=doc)
         self.options = tuple(options)
+
+    def _arguments(self) -> list[str]:
+        return [quoted(self.options), *super()._arguments()]
 
     def kind(self) -> str:
         """Describe what is accepted, for listings."""
         return " | ".join(f'"{o}"' for o in self.options)
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> str:
+    def read(self, value: object, *, where: str, bare: bool = True) -> str:
         """Accept one of the options."""
         if not isinstance(value, str) or value not in self.options:
             hint = nearest(str(value), self.options)
@@ -293,7 +312,7 @@ class Choice(Setting[str]):
 class Text(Setting[str]):
     """Free text."""
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> str:
+    def read(self, value: object, *, where: str, bare: bool = True) -> str:
         """Accept text."""
         if not isinstance(value, str):
             raise ConfigurationError(f"{where} is {shown(value)}; it takes text")
@@ -306,7 +325,7 @@ class Table(Setting[dict[str, Any]]):
     def __init__(self, *, doc: str = "") -> None:
         super().__init__({}, doc=doc)
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> dict[str, Any]:
+    def read(self, value: object, *, where: str, bare: bool = True) -> dict[str, Any]:
         """Accept a table, or its text as in a file."""
         if isinstance(value, str):
             import tomllib
@@ -323,7 +342,7 @@ class Table(Setting[dict[str, Any]]):
 class FileTable(Table):
     """Files by name: ``files = { a = "a.fmu" }``, relative to the system file."""
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> dict[str, Any]:
+    def read(self, value: object, *, where: str, bare: bool = True) -> dict[str, Any]:
         """Accept a table of paths, as `FilePath` accepts them."""
         table = super().read(value, where=where, bare=bare)
         return {k: FilePath().read(v, where=f"{where}.{k}") for k, v in table.items()}
@@ -343,7 +362,7 @@ _VARIABLE = re.compile(r"\$\{(\w+)(?::-([^}]*))?\}|\$(\w+)")
 class FilePath(Setting[Path]):
     """A file: relative to the system file, with ``${NAME:-fallback}`` from the environment."""
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> Path:
+    def read(self, value: object, *, where: str, bare: bool = True) -> Path:
         """Accept a path; environment variables and ``~`` are expanded."""
         if isinstance(value, Path):
             return value
@@ -373,7 +392,7 @@ class OptionalFilePath(Setting[Path | None]):
     def __init__(self, *, doc: str = "") -> None:
         super().__init__(None, doc=doc)
 
-    def read(self, value: Any, *, where: str, bare: bool = True) -> Path | None:
+    def read(self, value: object, *, where: str, bare: bool = True) -> Path | None:
         """Accept a path as `FilePath` does, or None."""
         return None if value is None else FilePath().read(value, where=where, bare=bare)
 

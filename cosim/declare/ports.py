@@ -23,17 +23,22 @@ from dataclasses import field as dataclass_field
 from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.memory.fields import Field, Unit
+from terrafix.cosim.memory.fields import Field, Unit, quoted
 from terrafix.cosim.memory.messages import MessageReader, MessageWriter
 from terrafix.cosim.memory.slots import BundleView, WindowView
 
 When = Literal["start", "end"]
 Kind = Literal["signal", "message", "shared"]
-View = TypeVar("View")
+Default = ArrayLike | Mapping[str, ArrayLike]
+"""What an unconnected input reads: of a bundle by field."""
+View_co = TypeVar("View_co", covariant=True)
+MOST_WRITTEN = 9  # numbers of an array
+LONGEST_WRITTEN = 60  # characters of a value
+MOST_FIELDS = 3  # of a bundle, in a repr
 
 
 class Declaration:
@@ -45,9 +50,31 @@ class Declaration:
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
+    def _arguments(self) -> list[str]:
+        """What its constructor was given, as it is written in Python; its meaning left out."""
+        return []
 
-class Port(Declaration, Generic[View]):
-    """Base of all ports. Reading one on a component gives its `View`, once bound.
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(self._arguments())})"
+
+    def _absent(self, obj: object, what: str) -> AttributeError:
+        """What a person is told who reads a component outside a simulation."""
+        owner = getattr(obj, "name", "") or type(obj).__name__
+        return AttributeError(f"'{owner}.{self.name}' {what}", name=self.name, obj=obj)
+
+
+def written(value: object) -> str:
+    """Write a value as in Python, in one short line."""
+    if isinstance(value, str):
+        return quoted(value)
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist() if value.size <= MOST_WRITTEN else f"array {value.shape}"
+    text = str(value)
+    return text if len(text) <= LONGEST_WRITTEN else f"{text[: LONGEST_WRITTEN - 3]}..."
+
+
+class Port(Declaration, Generic[View_co]):
+    """Base of all ports. Reading one on a component gives its `View_co`, once bound.
 
     Attributes
     ----------
@@ -82,7 +109,7 @@ class Port(Declaration, Generic[View]):
         fields: Mapping[str, Field] | None = None,
         doc: str = "",
         at: When = "end",
-        default: Any = None,
+        default: Default | None = None,
         queue: int = 1,
         window: bool = False,
         optional: bool = False,
@@ -138,14 +165,39 @@ class Port(Declaration, Generic[View]):
         """The field of a port that is no bundle."""
         return self.fields[""]
 
+    def _arguments(self) -> list[str]:
+        given = self._bundled() if self.is_bundle else self.single.arguments()
+        if self.at != "end":
+            given.append(f"at={quoted(self.at)}")
+        if self.default is not None:
+            given.append(f"default={written(self.default)}")
+        elif self.optional:
+            given.append("optional=True")
+        if self.queue != 1:
+            given.append(f"queue={self.queue}")
+        if self.needed_at_start:
+            given.append("needed_at_start=True")
+        return given
+
+    def _bundled(self) -> list[str]:
+        listed = [f"{quoted(name)}: {field!r}" for name, field in self.fields.items()]
+        if len(listed) > MOST_FIELDS + 1:
+            listed[MOST_FIELDS:] = [f"... {len(listed) - MOST_FIELDS} more"]
+        keyword = "fields=" if self.kind == "message" else ""
+        return [f"{keyword}{{{', '.join(listed)}}}"]
+
     @overload
     def __get__(self, obj: None, owner: type) -> Self: ...
     @overload
-    def __get__(self, obj: object, owner: type) -> View: ...
-    def __get__(self, obj: object | None, owner: type) -> Self | View:
+    def __get__(self, obj: object, owner: type) -> View_co: ...
+    def __get__(self, obj: object | None, owner: type) -> Self | View_co:
         if obj is None:
             return self
-        return obj._views[self.name]  # type: ignore[attr-defined, no-any-return]
+        try:
+            return obj._views[self.name]  # type: ignore[attr-defined, no-any-return]
+        except KeyError:
+            what = f'is a port: it has a value only in a simulation; ["{self.name}"] names it'
+            raise self._absent(obj, what) from None
 
     def __set__(self, obj: object, value: object) -> None:
         raise AttributeError(f"'{self.name}' is an input: components do not write their inputs")
@@ -182,8 +234,16 @@ class BundleInput(Port[BundleView]):
 
     is_input = True
 
-    def __init__(self, fields: Mapping[str, Field], **options: Any) -> None:
-        super().__init__(fields=fields, **options)
+    def __init__(
+        self,
+        fields: Mapping[str, Field],
+        *,
+        at: When = "end",
+        default: Default | None = None,
+        optional: bool = False,
+        doc: str = "",
+    ) -> None:
+        super().__init__(fields=fields, at=at, default=default, optional=optional, doc=doc)
 
 
 class BundleOutput(Port[BundleView]):
@@ -217,31 +277,57 @@ class WindowInput(Port[WindowView]):
 
     is_input = True
 
-    def __init__(self, shape: Sequence[int | None] = (), **options: Any) -> None:
-        super().__init__(shape, window=True, **options)
+    def __init__(
+        self,
+        shape: Sequence[int | None] = (),
+        *,
+        unit: Unit = "1",
+        frame: str | None = None,
+        dtype: DTypeLike = np.float64,
+        labels: Sequence[str] = (),
+        at: When = "end",
+        default: Default | None = None,
+        optional: bool = False,
+        doc: str = "",
+    ) -> None:
+        super().__init__(
+            shape,
+            unit=unit,
+            frame=frame,
+            dtype=dtype,
+            labels=labels,
+            at=at,
+            default=default,
+            optional=optional,
+            window=True,
+            doc=doc,
+        )
 
 
-class SharedInput(Port[Any]):
+class _Shared(Port[NDArray[Any]]):
+    """One value for all members, passed by reference."""
+
+    kind = "shared"
+
+    @overload
+    def __get__(self, obj: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, obj: object, owner: type) -> NDArray[Any]: ...
+    def __get__(self, obj: object | None, owner: type) -> Self | NDArray[Any]:
+        if obj is None:
+            return self
+        slot: Any = super().__get__(obj, owner)
+        return slot.value  # type: ignore[no-any-return]
+
+
+class SharedInput(_Shared):
     """One value for all members, read by reference."""
 
-    kind = "shared"
     is_input = True
 
-    def __get__(self, obj: object | None, owner: type) -> Any:
-        if obj is None:
-            return self
-        return obj._views[self.name].value  # type: ignore[attr-defined]
 
-
-class SharedOutput(Port[Any]):
+class SharedOutput(_Shared):
     """One value for all members; assigning publishes the array itself, without a copy."""
-
-    kind = "shared"
-
-    def __get__(self, obj: object | None, owner: type) -> Any:
-        if obj is None:
-            return self
-        return obj._views[self.name].value  # type: ignore[attr-defined]
 
     def __set__(self, obj: object, value: object) -> None:
         obj._views[self.name].put(value)  # type: ignore[attr-defined]
@@ -257,12 +343,16 @@ class State(Declaration):
         unit: Unit = "1",
         frame: str | None = None,
         dtype: DTypeLike = np.float64,
-        start: Any = 0,
+        start: ArrayLike = 0,
         doc: str = "",
     ) -> None:
         self.field = Field(tuple(shape), unit, frame, dtype, doc=doc)
         self.start = start
         self.doc = doc
+
+    def _arguments(self) -> list[str]:
+        start = [] if np.array_equal(self.start, 0) else [f"start={written(self.start)}"]
+        return [*self.field.arguments(), *start]
 
     @overload
     def __get__(self, obj: None, owner: type) -> Self: ...
@@ -271,7 +361,10 @@ class State(Declaration):
     def __get__(self, obj: object | None, owner: type) -> Self | NDArray[Any]:
         if obj is None:
             return self
-        return obj._states[self.name]  # type: ignore[attr-defined, no-any-return]
+        try:
+            return obj._states[self.name]  # type: ignore[attr-defined, no-any-return]
+        except KeyError:
+            raise self._absent(obj, "is a state: it has a value only in a simulation") from None
 
     def __set__(self, obj: object, value: object) -> None:
         obj._states[self.name][...] = value  # type: ignore[attr-defined]

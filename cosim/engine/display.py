@@ -4,32 +4,66 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from rich import box
-from rich.markup import escape
-from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 
 from terrafix.cosim.show.numbers import is_consistency, is_quantity, number, shown_unit, summaries
+from terrafix.cosim.show.tables import Block, Table, first
 
 if TYPE_CHECKING:
-    from terrafix.cosim.engine.simulation import Result
+    import xarray
 
 NAMED_MEMBERS = 8  # numbers of excluded members that are listed before "..."
+MOST_ROWS = 12  # recorded variables that are listed
+FEW_ROWS = 4  # below an evaluation
 
 
-def result_tables(result: Result) -> list[Any]:
-    """What a person wants to know of a run, as rich renderables in the order of reading."""
-    shown: list[Any] = [_header(result)]
+class Flown(Protocol):
+    """What is told of a run: a `terrafix.Result`."""
+
+    system: str
+    members: int
+    ticks: int
+    component_steps: int
+    wall_s: float
+    setup_s: float
+    kernel: str
+    status: str
+    evaluation: dict[str, Any]
+    overruns: dict[str, int]
+
+    @property
+    def excluded(self) -> Sequence[Mapping[str, Any]]:
+        """Failed members."""
+
+
+def result_tables(result: Flown) -> list[Block]:
+    """What a person wants to know of a run, in the order of reading."""
+    shown: list[Block] = [_header(result)]
     for path, summary in summaries(result.evaluation).items():
         shown += _evaluation(path, summary, result.members)
     shown += [Text(line) for line in _troubles(result)]
     return shown
 
 
-def _header(result: Result) -> Text:
+def records_table(dataset: xarray.Dataset, *, brief: bool) -> list[Block]:
+    """What a result holds over time, in one table; a few of them where `brief`."""
+    names = [str(n) for n in dataset.data_vars if not str(n).startswith("parameter:")]
+    kept, more = first(names, FEW_ROWS if brief else MOST_ROWS)
+    rows = [[name, *_extents(dataset[name])] for name in kept]
+    table = Table(["in .dataset", "unit", "samples", "members", "shape"], rows, words=2)
+    left_out = [Text(f"and {more} more", style="dim")] if more else []
+    return ["", table, *left_out] if rows else []
+
+
+def _extents(variable: xarray.DataArray) -> list[str]:
+    samples, members, *shape = variable.shape
+    unit = str(variable.attrs.get("units", ""))
+    return [unit, str(samples), str(members), " x ".join(map(str, shape)) or "scalar"]
+
+
+def _header(result: Flown) -> Text:
     count = f"{result.members} member{'s' if result.members > 1 else ''}"
     facts = [
         f"{result.ticks:,} ticks",
@@ -47,11 +81,12 @@ def _header(result: Result) -> Text:
 # ---------------------------------------------------------------------- one evaluation
 
 
-def _evaluation(path: str, summary: Mapping[str, Any], members: int) -> Iterator[Any]:
+def _evaluation(path: str, summary: Mapping[str, Any], members: int) -> Iterator[Block]:
     quantities = {name: value for name, value in summary.items() if is_quantity(value)}
     if path:
         yield Text(f"\n{path}", style="bold")
     if quantities:
+        yield ""
         yield _quantity_table(quantities, members)
     for name, value in summary.items():
         if is_consistency(value):
@@ -64,19 +99,12 @@ def _evaluation(path: str, summary: Mapping[str, Any], members: int) -> Iterator
             yield Text(f"{name}  {value if isinstance(value, str) else number(value)}")
 
 
-def _quantity_table(quantities: Mapping[str, Mapping[str, Any]], members: int) -> Padding:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+def _quantity_table(quantities: Mapping[str, Mapping[str, Any]], members: int) -> Table:
     ensemble = members > 1
-    table.add_column("at the end")
-    table.add_column("axis")
-    table.add_column("unit")
-    table.add_column("mean error" if ensemble else "error", justify="right")
-    table.add_column("predicted sigma", justify="right")
-    if ensemble:
-        table.add_column("sample sigma", justify="right")
-        table.add_column("sample/predicted", justify="right")
-    else:
-        table.add_column("error/sigma", justify="right")
+    headers = ["at the end", "axis", "unit", "mean error" if ensemble else "error"]
+    headers += ["predicted sigma"]
+    headers += ["sample sigma", "sample / predicted"] if ensemble else ["error/sigma"]
+    rows = []
     for name, quantity in quantities.items():
         unit, factor = shown_unit(str(quantity["unit"]))
         errors = list(quantity["error"])
@@ -90,8 +118,8 @@ def _quantity_table(quantities: Mapping[str, Mapping[str, Any]], members: int) -
                 row += [_scaled(sample[i], factor), _ratio(sample[i], predicted[i])]
             else:
                 row += [_ratio(error, predicted[i])]
-            table.add_row(*map(escape, row), end_section=i == len(errors) - 1)
-    return Padding(table, (1, 0, 0, 0))
+            rows.append(row)
+    return Table(headers, rows, words=3, grouped=True)
 
 
 def _column(values: Sequence[float | None] | None, n: int) -> Sequence[float | None]:
@@ -131,7 +159,7 @@ def _fixes_line(fixes: Sequence[Mapping[str, Any]]) -> str:
 # ---------------------------------------------------------------------- what went wrong
 
 
-def _troubles(result: Result) -> Iterator[str]:
+def _troubles(result: Flown) -> Iterator[str]:
     """Excluded members by component and reason, and messages that nobody read in time."""
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
     for failure in result.excluded:

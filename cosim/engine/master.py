@@ -1,17 +1,14 @@
 """The master: steps every component that is due, then transfers, in an order fixed beforehand.
 
-It knows ticks, components and links, and nothing of what flows through them. Which components are
-due comes from a heap of next ticks; the work of a tick is a list made once for each combination
-of components that are due together. Where these are symbolic components with nothing between them,
-their ticks up to the next other event are handed to one call of compiled code (`stretch`).
+It knows ticks, components and links, and nothing of what flows through them: `agenda` says who is
+due, `program` what there is to do then.
 """
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,71 +16,13 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.arrays import Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, StepError, TerrafixError
-from terrafix.cosim.declare.component import Component
-from terrafix.cosim.engine.build import Wiring, bind_components, connect_ports
-from terrafix.cosim.kernels.stretch import Stretch
+from terrafix.cosim.engine.agenda import Agenda
+from terrafix.cosim.engine.build import bind_components, connect_ports
+from terrafix.cosim.engine.program import Entry, Program, stretch_of
 from terrafix.cosim.kernels.symbolic import NOT_FINITE, SymbolicComponent
-from terrafix.cosim.memory.links import CopyMessage, DelayLine, Transfer
-from terrafix.cosim.memory.messages import MessageReader
+from terrafix.cosim.memory.links import DelayLine
 from terrafix.cosim.system.check import Plan
 from terrafix.cosim.system.dispersion import apply_all
-
-
-def _reader(transfer: Transfer) -> MessageReader | None:
-    """The reader that a transfer refreshes, if that is all it does."""
-    owner = getattr(transfer, "__self__", None)
-    return owner if isinstance(owner, MessageReader) and owner.depth == 1 else None
-
-
-class _Group:
-    """Components (or one recorder) that step at the same ticks."""
-
-    def __init__(self, rate: Rate, plan: Plan) -> None:
-        self.rate = rate
-        self._base, self._grid = plan.base, plan.grid
-        self._numerator, self._denominator = plan.base.numerator, plan.base.denominator
-        self.sample: Callable[[float], None] | None = None
-        # ticks from one activation to the next; 0 where they are listed
-        self.spacing = 0 if rate.period is None else int(rate.period / plan.base)
-        self.move_to(0)
-
-    def move_to(self, tick: int) -> None:
-        """Stand where everything up to and including `tick` has been done."""
-        self._ticks: Iterator[int] = self.rate.ticks(self._base, self._grid, after=tick)
-        self.tick = self.rate.last_tick(self._base, self._grid, tick)
-        self.dt = 0.0
-        self.next_tick = next(self._ticks, None)
-
-    def advance(self) -> None:
-        """Move to the next activation."""
-        assert self.next_tick is not None
-        self.dt = (self.next_tick - self.tick) * self._numerator / self._denominator
-        self.tick = self.next_tick
-        self.next_tick = next(self._ticks, None)
-
-
-class _Entry:
-    """One component's work at a tick."""
-
-    __slots__ = ("after", "before", "clear", "component", "group", "path", "step")
-
-    def __init__(self, path: str, component: Component, group: _Group, wiring: Wiring) -> None:
-        self.path = path
-        self.component = component
-        self.group = group
-        self.step = component.step
-        self.before: tuple[Transfer, ...] = tuple(wiring.before.get(path, ()))
-        self.after = tuple(wiring.after.get(path, ()))
-        self.clear = tuple(wiring.clear.get(path, ()))
-
-
-class _Program(NamedTuple):
-    """The work of a tick at which certain groups are due."""
-
-    entries: tuple[_Entry, ...]
-    latches: tuple[Transfer, ...]
-    samples: tuple[Callable[[float], None], ...]
-    stretch: Stretch | None
 
 
 class Master:
@@ -142,37 +81,19 @@ class Master:
             runs=int(members.max()) + 1 if runs is None else runs,
         )
         self.wiring = connect_ports(plan, len(members), self.active)
-        self._groups: list[_Group] = []
-        self._group_of: dict[str, int] = {}
+        self.agenda = Agenda(plan)
+        self.group_of: dict[str, int] = {}
+        self.entries: dict[str, Entry] = {}
         for path in plan.order:
-            rate = plan.flat.components[path].rate
-            assert rate is not None
-            self._group_of[path] = self._groups.index(self._group(rate))
-        self._entries = {
-            path: _Entry(
-                path,
-                plan.flat.components[path],
-                self._groups[self._group_of[path]],
-                self.wiring,
-            )
-            for path in plan.order
-        }
-        self._programs: dict[tuple[int, ...], _Program] = {}
-        self._heap: list[tuple[int, int]] = []
-
-    def _group(self, rate: Rate) -> _Group:
-        for group in self._groups:
-            if group.rate == rate and group.sample is None:
-                return group
-        group = _Group(rate, self.plan)
-        self._groups.append(group)
-        return group
+            component = plan.flat.components[path]
+            assert component.rate is not None
+            number = self.group_of[path] = self.agenda.number(component.rate)
+            self.entries[path] = Entry(path, component, self.agenda.groups[number], self.wiring)
+        self.programs: dict[tuple[int, ...], Program] = {}
 
     def observe(self, rate: Rate, sample: Callable[[float], None]) -> None:
         """Call `sample(t)` at a rate, after everything due has stepped; it influences nothing."""
-        group = _Group(rate, self.plan)
-        group.sample = sample
-        self._groups.append(group)
+        self.agenda.observe(rate, sample)
 
     def seconds(self, tick: int) -> float:
         """Time of a tick [s], by one division."""
@@ -201,7 +122,7 @@ class Master:
         Nothing delayed has arrived then, and start-reads have nothing to hold: these inputs are
         NaN, whatever the order. `observe` is false where a saved state replaces all of it.
         """
-        for entry in self._entries.values():
+        for entry in self.entries.values():
             try:
                 for transfer in entry.before:
                     if not isinstance(transfer, DelayLine):
@@ -213,80 +134,37 @@ class Master:
                 collect(0, 0.0)
             for clear in entry.clear:
                 clear()
-        for path in self._entries:
+        for path in self.entries:
             for transfer in self.wiring.latch.get(path, ()):
                 transfer(0)
         self._check_members()
-        for group in self._groups:
+        for group in self.agenda.groups:
             if observe and group.sample is not None and group.rate.starts_at_zero:
                 group.sample(0.0)
-        self._arm()
+        self.agenda.move_to(0)
 
-    def _arm(self) -> None:
-        self._heap = [
-            (g.next_tick, i) for i, g in enumerate(self._groups) if g.next_tick is not None
-        ]
-        heapq.heapify(self._heap)
-
-    def _program(self, due: tuple[int, ...]) -> _Program:
-        groups = set(due)
-        entries = tuple(e for p, e in self._entries.items() if self._group_of[p] in groups)
+    def _program(self, due: tuple[int, ...]) -> Program:
+        groups = self.agenda.groups
+        entries = tuple(e for p, e in self.entries.items() if self.group_of[p] in due)
         latches = tuple(t for e in entries for t in self.wiring.latch.get(e.path, ()))
-        samples = tuple(s for i in due if (s := self._groups[i].sample) is not None)
-        stretch = None
-        if len(due) == 1 and not samples and self._groups[due[0]].spacing:
-            stretch = self._stretch(entries, latches)
-        program = _Program(entries, latches, samples, stretch)
-        self._programs[due] = program
+        samples = tuple(s for i in due if (s := groups[i].sample) is not None)
+        alone = len(due) == 1 and not samples and groups[due[0]].spacing
+        stretch = stretch_of(entries, latches) if alone else None
+        program = self.programs[due] = Program(entries, latches, samples, stretch)
         return program
 
-    def _stretch(
-        self, entries: tuple[_Entry, ...], latches: tuple[Transfer, ...]
-    ) -> Stretch | None:
-        """The ticks of these components as one call, if nothing else happens at them.
-
-        None of them publishes messages, so that readers stand still once they have seen what
-        came before, and copies of messages have nothing to copy.
-        """
-        stages = []
-        for entry in entries:
-            component = entry.component
-            if not isinstance(component, SymbolicComponent) or entry.after or entry.clear:
-                return None
-            stage = component.kernel_stage
-            if stage is None:
-                return None
-            stages.append(stage)
-            for transfer in entry.before:
-                if not isinstance(transfer, CopyMessage) and _reader(transfer) is None:
-                    return None
-        if not stages or not all(isinstance(transfer, CopyMessage) for transfer in latches):
-            return None
-        try:
-            return Stretch(stages)
-        except ValueError:  # arrays that overlap
-            return None
-
-    def _fly(self, program: _Program, group: _Group, number: int, end: int) -> bool:
+    def _fly(self, program: Program, number: int, end: int) -> bool:
         """Step a group's ticks from its next one on, up to `end` and before anybody else's.
 
         Nothing is done, and False returned, if that is only one tick, or not like the others.
         """
-        assert program.stretch is not None
-        assert group.next_tick is not None
+        group, n_ticks = self.agenda.groups[number], self.agenda.alone(number, end)
         first, spacing = group.next_tick, group.spacing
-        # recorders look on once the others have stepped: a stretch may end at their tick
-        others = (tick - (self._groups[i].sample is None) for tick, i in self._heap if i != number)
-        last = min(end, *others) if len(self._heap) > 1 else end
-        n_ticks = (last - first) // spacing + 1
-        if n_ticks < 2 or first - group.tick != spacing or last * self._numerator > 2**53:
+        assert program.stretch is not None
+        assert first is not None
+        last = first + (n_ticks - 1) * spacing
+        if n_ticks < 2 or last * self._numerator > 2**53 or not program.settle(first):
             return False
-        for entry in program.entries:
-            for transfer in entry.before:
-                reader = _reader(transfer)
-                if reader is not None and reader.waiting:
-                    return False
-                transfer(first)
         components = [entry.component for entry in program.entries]
         dt = spacing * self._numerator / self._denominator
         failures = program.stretch.fly(
@@ -297,7 +175,6 @@ class Master:
             seconds_per_tick=(self._numerator, self._denominator),
             dt=dt,
         )
-        last = first + (n_ticks - 1) * spacing
         for component in components:
             assert isinstance(component, SymbolicComponent)
             component.stretched(n_ticks, self.seconds(last), dt)
@@ -307,15 +184,8 @@ class Master:
             components[failure.stage].fail(failure.members, NOT_FINITE)
             self._check_members()
         self.tick = last
-        group.move_to(last)
-        self._rearm(group, number)
+        self.agenda.leap(number, last)
         return True
-
-    def _rearm(self, group: _Group, number: int) -> None:
-        if group.next_tick is None:
-            heapq.heappop(self._heap)
-        else:
-            heapq.heapreplace(self._heap, (group.next_tick, number))
 
     def run_until(self, end: int) -> None:
         """Step to tick `end`.
@@ -336,28 +206,19 @@ class Master:
                     f"'{path}' has been terminated, or another simulation of the same system has "
                     "taken it over\n  run one after the other, or build the system twice"
                 )
-        heap, groups, programs = self._heap, self._groups, self._programs
+        agenda, programs = self.agenda, self.programs
         numerator, denominator = self._numerator, self._denominator
-        entry: _Entry | None = None
+        entry: Entry | None = None
         n_excluded = len(self.excluded)
         try:
-            while heap and heap[0][0] <= end:
-                tick = heap[0][0]
-                if all(tick < later[0] for later in heap[1:3]):  # the children of the root
-                    number = heap[0][1]
-                    due: tuple[int, ...] = (number,)
-                    group = groups[number]
-                    program = programs.get(due) or self._program(due)
-                    if program.stretch is not None and self._fly(program, group, number, end):
-                        n_excluded = len(self.excluded)
-                        continue
-                    group.advance()
-                    self._rearm(group, number)
-                else:
-                    due = self._pop(tick)
-                    program = programs.get(due) or self._program(due)
-                t = tick * numerator / denominator
-                self.tick = tick
+            while agenda.heap and (tick := agenda.heap[0][0]) <= end:
+                due = agenda.due(tick)
+                program = programs.get(due) or self._program(due)
+                if program.stretch is not None and self._fly(program, due[0], end):
+                    n_excluded = len(self.excluded)
+                    continue
+                agenda.advance(due)
+                self.tick, t = tick, tick * numerator / denominator
                 for entry in program.entries:
                     for transfer in entry.before:
                         transfer(tick)
@@ -366,12 +227,12 @@ class Master:
                         collect(tick, t)
                     for clear in entry.clear:
                         clear()
-                self.component_steps += len(program.entries)
                 entry = None
-                for transfer in program.latches:
-                    transfer(tick)
+                for latch in program.latches:
+                    latch(tick)
                 for sample in program.samples:
                     sample(t)
+                self.component_steps += len(program.entries)
                 if len(self.excluded) != n_excluded:
                     n_excluded = len(self.excluded)
                     self._check_members()
@@ -381,17 +242,6 @@ class Master:
             where = entry.path if entry is not None else "recorder"
             raise self._step_error(where, self.tick, error) from error
         self.tick = end
-
-    def _pop(self, tick: int) -> tuple[int, ...]:
-        due = []
-        while self._heap and self._heap[0][0] == tick:
-            number = heapq.heappop(self._heap)[1]
-            due.append(number)
-            group = self._groups[number]
-            group.advance()
-            if group.next_tick is not None:
-                heapq.heappush(self._heap, (group.next_tick, number))
-        return tuple(sorted(due))
 
     def _check_members(self) -> None:
         if not self.active.any():
@@ -442,7 +292,7 @@ class Master:
             "component_steps": self.component_steps,
             "active": self.active.copy(),
             "excluded": [dict(e) for e in self.excluded],
-            "components": {p: e.component.get_state() for p, e in self._entries.items()},
+            "components": {p: e.component.get_state() for p, e in self.entries.items()},
             "links": {name: k.get_state() for name, k in self.wiring.keepers.items()},
         }
 
@@ -453,9 +303,7 @@ class Master:
         self.active[:] = saved["active"]
         self.excluded[:] = [dict(e) for e in saved["excluded"]]
         for path, state in saved["components"].items():
-            self._entries[path].component.set_state(state)
+            self.entries[path].component.set_state(state)
         for name, state in saved["links"].items():
             self.wiring.keepers[name].set_state(state)
-        for group in self._groups:
-            group.move_to(self.tick)
-        self._arm()
+        self.agenda.move_to(self.tick)

@@ -20,7 +20,8 @@ from terrafix.cosim.basics.errors import (
     RateError,
     StepError,
 )
-from terrafix.cosim.engine.simulation import Progress, Result, Simulation
+from terrafix.cosim.engine.result import Result
+from terrafix.cosim.engine.simulation import Progress, Simulation
 from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
 from terrafix.cosim.records.places import Places, result_target
 from terrafix.cosim.system.system import System

@@ -1,13 +1,12 @@
-"""A system built for one ensemble: components bound, kernels made, recorders set; its result."""
+"""A system built for one ensemble: components bound, kernels made, recorders set."""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from terrafix.cosim.declare.evaluation import Evaluation
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import State
 from terrafix.cosim.engine.master import Master
+from terrafix.cosim.engine.result import Exclusion, Result
 from terrafix.cosim.kernels.build import build_kernels
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.slots import SignalSlot
@@ -29,63 +29,9 @@ from terrafix.cosim.system.check import Plan, check, record_rate
 from terrafix.cosim.system.identity import configuration, difference
 from terrafix.cosim.system.system import System
 
-if TYPE_CHECKING:
-    import xarray
-
 Progress = Callable[[str, float], None]
 """Called with what is being done and the fraction done, often."""
 MAX_MEMBER = 2**32 - 1  # a word of the counter that noise is drawn from
-
-
-@dataclass
-class Result:
-    """What a run gives back.
-
-    Attributes
-    ----------
-    system : str
-        Name of the system.
-    seed : int
-    members : int
-        Number of members flown.
-    excluded : list of dict
-        Failed members: ``member``, ``component``, ``t_s``, ``reason``.
-    ticks, component_steps : int
-    wall_s, setup_s : float
-        Running time, and the time to check, build and compile before it.
-    kernel : str
-        Which kind of kernel stepped the symbolic components.
-    evaluation : dict
-        What the evaluation component publishes; with several, by component path.
-    dataset : xarray.Dataset
-        Records, parameters as they reached the components, configuration.
-    status : str
-        ``"complete"`` or what ended the run early.
-    """
-
-    system: str
-    seed: int
-    members: int
-    excluded: list[dict[str, Any]]
-    ticks: int
-    component_steps: int
-    wall_s: float
-    setup_s: float
-    kernel: str
-    evaluation: dict[str, Any]
-    dataset: xarray.Dataset
-    status: str = "complete"
-    overruns: dict[str, int] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    out: Path | None = None
-
-    def summary(self) -> dict[str, Any]:
-        """Plain types for JSON."""
-        names = (
-            "system seed members excluded ticks component_steps wall_s setup_s kernel "
-            "evaluation status overruns notes"
-        )
-        return {n: getattr(self, n) for n in names.split()}
 
 
 class Simulation:
@@ -231,6 +177,9 @@ class Simulation:
                     found[target] = (unit, component._states[name].copy())
         return found
 
+    def __repr__(self) -> str:
+        return f"<{_standing(self)}>" if hasattr(self, "setup_s") else "<Simulation, not built>"
+
     # ------------------------------------------------------------------ running
 
     def initialize(self) -> None:
@@ -356,7 +305,7 @@ class Simulation:
             system=self.system.name,
             seed=self.seed,
             members=len(self.members),
-            excluded=list(self.master.excluded),
+            excluded=cast("list[Exclusion]", list(self.master.excluded)),
             ticks=self.master.tick,
             component_steps=self.master.component_steps,
             wall_s=wall_s,
@@ -368,6 +317,17 @@ class Simulation:
             overruns={path: r.overruns for path, r in readers.items() if r.overruns},
             notes=self._notes(),
         )
+
+
+def _standing(simulation: Simulation) -> str:
+    """Which simulation it is, and how far it got."""
+    n, master = len(simulation.members), simulation.master
+    return (
+        f"Simulation of '{simulation.system.name}': {n} member{'' if n == 1 else 's'}, "
+        f"seed {simulation.seed}, kernel {simulation.kernel}, "
+        f"t = {master.seconds(master.tick):g} s"
+        + ("" if simulation.initialized else ", not initialized")
+    )
 
 
 def _refuse_too_large(plan: Plan, n_members: int) -> None:

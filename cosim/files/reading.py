@@ -250,6 +250,11 @@ def _component(
             made._base[key] = None
             refused += 1
     made.rate = load.attempt(_rate, timing, f"'{name}'") or made.rate
+    if not refused:
+        for key in (k for k, _, from_file in values if not from_file and k not in TIMING):
+            reason = made.idle(key)
+            if reason is not None:
+                load.refuse(f"cannot set '{name}.{key}'\n  {reason}\n  choose otherwise, too")
     if not refused and not made.missing_settings():
         before = len(load.problems)
         load.attempt(made.prepare)

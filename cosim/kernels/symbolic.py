@@ -27,7 +27,6 @@ from terrafix.cosim.declare.ports import Capabilities
 from terrafix.cosim.kernels.build import Argument, BoundKernel, Kernel, Result, Specification
 from terrafix.cosim.kernels.stretch import Stage
 from terrafix.cosim.kernels.toolchain import cache_directory, wanted_kernel
-from terrafix.cosim.kernels.vector import VectorBinding
 from terrafix.cosim.memory.messages import MessageReader, MessageWriter
 from terrafix.cosim.memory.slots import BundleView
 
@@ -73,6 +72,9 @@ class SymbolicModel(Protocol):
     def shape(self, name: str) -> tuple[int, ...]:
         """Shape of a named quantity."""
 
+    def uses(self, parameter: str) -> bool:
+        """Whether any expression depends on a parameter."""
+
     @property
     def derivatives(self) -> Symbols:
         """Derivatives of continuous states by name."""
@@ -114,22 +116,29 @@ class SymbolicComponent(Component):
         return self._model[1]
 
     _model: tuple[Any, SymbolicModel] | None = None
-    _kept: tuple[Any, Kernel] | None = None
+    _kept: tuple[SymbolicModel, Any, Kernel] | None = None
 
     @property
     def kept_kernel(self) -> Kernel | None:
         """The kernel of an earlier simulation of this component, if it would be made alike now."""
-        now = (id(self.model), self.environment.quiet, _asked_for())
-        return self._kept[1] if self._kept is not None and self._kept[0] == now else None
+        if self._kept is None:
+            return None
+        model, made, kernel = self._kept
+        alike = model is self.model and made == (self.environment.quiet, _asked_for())
+        return kernel if alike else None
 
     def keep_kernel(self, kernel: Kernel) -> None:
         """Keep a kernel for later simulations."""
-        self._kept = ((id(self.model), self.environment.quiet, _asked_for()), kernel)
+        self._kept = self.model, (self.environment.quiet, _asked_for()), kernel
 
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: neither models nor kernels, which are made there."""
-        left = {"_model", "_kept", "kernel", "_call"}
+        left = {"_model", "_kept", "kernel", "call"}
         return {k: v for k, v in self.__dict__.items() if k not in left}
+
+    def takes(self, name: str) -> bool:
+        """Whether a parameter has any effect, as the choices are now."""
+        return not isinstance(self.settings()[name], Parameter) or self.model.uses(name)
 
     def validate(self) -> None:
         """Check that every name of the model is a port or parameter of this component."""
@@ -205,7 +214,7 @@ class SymbolicComponent(Component):
         self._dt = np.zeros(1)
         self._t = np.zeros(1)
         self._failed = np.zeros(n, dtype=np.uint8)
-        self._messages: dict[str, FloatArray] = {}
+        self.messages: dict[str, FloatArray] = {}
 
     def _state_shape(self, name: str) -> tuple[int, ...]:
         shape = self.model.shape(name)
@@ -220,7 +229,7 @@ class SymbolicComponent(Component):
         results |= {f"state:{n}": self._states[n] for n in model.states}
         keys = {n: stream_key(env.seed, env.path, n) for n in model.noise}
         self.kernel = kernel
-        self._call: BoundKernel = kernel.bind(
+        self.call: BoundKernel = kernel.bind(
             env.n_members,
             arrays,
             results,
@@ -258,9 +267,9 @@ class SymbolicComponent(Component):
         head, _, tail = name.partition(".")
         view = self._views[head]
         if isinstance(view, MessageWriter):
-            self._messages.setdefault(head, np.ones(self.n_members))
+            self.messages.setdefault(head, np.ones(self.n_members))
             if tail == "valid":
-                return self._messages[head]
+                return self.messages[head]
             draft: FloatArray = view.draft[tail]
             return draft
         if isinstance(view, BundleView):
@@ -307,18 +316,18 @@ class SymbolicComponent(Component):
     def _step_impl(self, t: float, dt: float) -> None:
         self._t[0] = t
         self._dt[0] = dt
-        if self._call(self.step_index):
+        if self.call(self.step_index):
             failed = self._failed.astype(np.bool_)
             self._failed[:] = 0
             self.fail(failed, NOT_FINITE)
-        if self._messages:
+        if self.messages:
             self._publish_messages(t)
 
     @property
     def kernel_stage(self) -> Stage | None:
         """What a stretch needs; None where a step is more than a call of a vector kernel."""
-        call = self._call
-        return call.stage if isinstance(call, VectorBinding) and not self._messages else None
+        stage: Stage | None = getattr(self.call, "stage", None)
+        return None if self.messages else stage
 
     def stretched(self, n_steps: int, t: float, dt: float) -> None:
         """Note that a stretch made `n_steps` steps of this component, the last at `t` [s]."""
@@ -327,7 +336,7 @@ class SymbolicComponent(Component):
         self._dt[0] = dt
 
     def _publish_messages(self, t: float) -> None:
-        for name, valid in self._messages.items():
+        for name, valid in self.messages.items():
             mask = valid > 0.5
             if mask.any():
                 self._views[name].publish_draft(t, mask)
@@ -346,6 +355,6 @@ def _each_member(
         return [np.empty((0, function.numel_out(i))) for i in range(function.n_out())]
     whole = function.map(n_members)
     columns = [np.asfortranarray(r.T) for r in rows]
-    results = whole(*columns, *(np.full((1, n_members), value) for value in clock))
-    results = results if isinstance(results, tuple | list) else (results,)
-    return [np.asarray(r, dtype=np.float64).T for r in results]
+    arguments = [*columns, *(np.full((1, n_members), value) for value in clock)]
+    results = whole.call(arguments)  # a list, also of a function without arguments
+    return [np.asarray(r.full(), dtype=np.float64).T for r in results]

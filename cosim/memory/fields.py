@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from terrafix.cosim.basics.errors import ConfigurationError
 Unit = str | tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Field:
     """One array of a port.
 
@@ -68,3 +69,26 @@ class Field:
     def unit_text(self) -> str:
         """The unit as a person writes it."""
         return self.unit if isinstance(self.unit, str) else "(" + ", ".join(self.unit) + ")"
+
+    def arguments(self) -> list[str]:
+        """What its constructor was given, as it is written in Python; its meaning left out."""
+        written = [str(self.shape)] if self.shape else []
+        if self.unit != "1":
+            written.append(f"unit={quoted(self.unit)}")
+        if self.frame is not None:
+            written.append(f"frame={quoted(self.frame)}")
+        if np.dtype(self.dtype) != np.float64:
+            written.append(f"dtype={quoted(str(np.dtype(self.dtype)))}")
+        if self.ragged:
+            written.append("ragged=True")
+        return written
+
+    def __repr__(self) -> str:
+        return f"Field({', '.join(self.arguments())})"
+
+
+def quoted(text: str | tuple[str, ...]) -> str:
+    """Write a text, or several, as they are written in our Python: in double quotes."""
+    if isinstance(text, str):
+        return json.dumps(text, ensure_ascii=False)
+    return f"({', '.join(map(quoted, text))}{',' if len(text) == 1 else ''})"

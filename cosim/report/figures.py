@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.lincov.deviations import LinearCovariance
+from terrafix.cosim.lincov.prediction import LinearCovariance
 from terrafix.cosim.show.numbers import shown_unit
 from terrafix.cosim.show.plots import PREDICTED, Panel, draw_panel
 

@@ -9,8 +9,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from html import escape
 from typing import Any
 
-from terrafix.cosim.lincov.deviations import LinearCovariance
+from terrafix.cosim.campaign.statistics.ensemble import facts_of
+from terrafix.cosim.campaign.statistics.moments import end_rows
 from terrafix.cosim.lincov.display import describe
+from terrafix.cosim.lincov.prediction import LinearCovariance
 from terrafix.cosim.report.figures import figures, render
 from terrafix.cosim.report.reading import Campaign
 from terrafix.cosim.show.numbers import number, shown_unit
@@ -136,7 +138,7 @@ def _evaluation(campaign: Campaign, path: str) -> Iterator[str]:
     suffix = "" if len(campaign.paths) == 1 else f" ({escape(path)})"
     yield f"<h2>Errors at the end{suffix}</h2>"
     yield from _end_table(evaluation, prediction)
-    yield from _consistency(evaluation)
+    yield f"<p></p>{_definitions(facts_of(evaluation))}"
     yield f"<h2>Figures{suffix}</h2>"
     drawn = figures(dataset, prediction)
     for name, draw in drawn.items():
@@ -165,54 +167,21 @@ def _end_table(evaluation: Mapping[str, Any], prediction: LinearCovariance | Non
     text = {"quantity", "axis", "unit"}
     cells = "".join(f"<th{' class=text' if h in text else ''}>{h}</th>" for h in heads)
     yield f'<div class="wide"><table><tr>{cells}</tr>'
-    place = 0
-    for name, q in evaluation.items():
-        if not isinstance(q, Mapping) or "sigma_sample" not in q:
-            continue
-        unit, factor = shown_unit(q["unit"])
-        for i, axis in enumerate(q["axes"]):
-            low, high = q["ratio_interval_95"][i]
-            off = low is not None and not low <= 1.0 <= high
-            values = [
-                None if q[k][i] is None else q[k][i] * factor
-                for k in ("mean_error", "standard_error", "sigma_sample", "sigma_predicted")
-            ]
-            row = [name if i == 0 else "", axis, unit if i == 0 else ""]
-            cells = "".join(f'<td class="text">{escape(str(c))}</td>' for c in row)
-            cells += "".join(f"<td>{number(v)}</td>" for v in values)
-            mark = ' class="off"' if off else ""
-            cells += f"<td{mark}>{number(q['ratio'][i], 3)}</td>"
-            interval = "-" if low is None else f"{low:.3f} to {high:.3f}"
-            cells += f"<td{mark}>{interval}</td>"
-            if prediction is not None:
-                cells += f"<td>{number(float(prediction.sigma[-1, place]) * factor)}</td>"
-            yield f"<tr{' class=first' if i == 0 else ''}>{cells}</tr>"
-            place += 1
+    for place, row in enumerate(end_rows(evaluation)):
+        unit, factor = shown_unit(row.unit)
+        names = [row.quantity if row.first else "", row.axis, unit if row.first else ""]
+        cells = "".join(f'<td class="text">{escape(name)}</td>' for name in names)
+        for v in (row.mean_error, row.standard_error, row.sigma_sample, row.sigma_predicted):
+            cells += f"<td>{number(None if v is None else v * factor)}</td>"
+        low, high = row.interval or (0.0, 2.0)
+        mark = "" if low <= 1.0 <= high else ' class="off"'
+        cells += f"<td{mark}>{number(row.ratio, 3)}</td>"
+        interval = "-" if row.interval is None else f"{low:.3f} to {high:.3f}"
+        cells += f"<td{mark}>{interval}</td>"
+        if prediction is not None:
+            cells += f"<td>{number(float(prediction.sigma[-1, place]) * factor)}</td>"
+        yield f"<tr{' class=first' if row.first else ''}>{cells}</tr>"
     yield "</table></div>"
-
-
-def _consistency(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    facts = []
-    for name in ("nees", "nis"):
-        c = evaluation.get(name)
-        if c and c["mean"] is not None:
-            low, high = c["interval_95"]
-            facts.append(
-                (
-                    name.upper(),
-                    f"{number(c['mean'])} on average, expected {number(c['dof'])}; 95 % interval "
-                    f"{number(low)} to {number(high)}; {c['fraction_inside']:.0%} of the epochs "
-                    "inside theirs",
-                )
-            )
-    white = evaluation.get("whiteness")
-    if white:
-        values = ", ".join(
-            f"{number(r, 2)} ± {number(s, 1)}"
-            for r, s in zip(white["correlation"], white["standard_error"], strict=True)
-        )
-        facts.append(("whiteness", f"correlation of successive innovations {values}"))
-    yield "<p></p>" + _definitions(facts)
 
 
 def _budget_table(prediction: LinearCovariance) -> Iterator[str]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.campaign.results import SCHEMA
 from terrafix.cosim.campaign.store import RESULT, SUMMARY
-from terrafix.cosim.lincov.deviations import LinearCovariance
+from terrafix.cosim.lincov.prediction import LinearCovariance
 
 if TYPE_CHECKING:
     import xarray

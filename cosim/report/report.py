@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
-from terrafix.cosim.lincov.deviations import SCHEMA as LINCOV_SCHEMA
-from terrafix.cosim.lincov.deviations import LinearCovariance, linear_covariance
+from terrafix.cosim.lincov.deviations import linear_covariance
+from terrafix.cosim.lincov.prediction import SCHEMA as LINCOV_SCHEMA
+from terrafix.cosim.lincov.prediction import LinearCovariance
 from terrafix.cosim.report.reading import Campaign, read_campaign
 
 if TYPE_CHECKING:

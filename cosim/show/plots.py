@@ -9,7 +9,10 @@ recorded signals over time.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +25,7 @@ from terrafix.cosim.show.numbers import shown_unit
 
 if TYPE_CHECKING:
     import xarray
+    from matplotlib.figure import Figure
 
 POINTS = 1200
 """Points of a line; beyond, pairs of least and greatest value of equal stretches are drawn."""
@@ -67,22 +71,56 @@ def plot_result(dataset: xarray.Dataset, path: str | Path) -> None:
     ConfigurationError
         If there is nothing to draw, or the file cannot be written.
     """
-    import matplotlib.style
-
     path = Path(path)
     about = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-    with (
-        matplotlib.style.context("default", after_reset=True),
-        matplotlib.rc_context({"svg.hashsalt": "terrafix", "axes.axisbelow": True}),
-    ):
+    with own_style():
         drawn = figure(dataset)
+        kinds = drawn.canvas.get_supported_filetypes()
+        if path.suffix.lower().removeprefix(".") not in kinds:
+            raise ConfigurationError(
+                f"'{path}' is no picture\n  its ending says what is drawn: "
+                f"name it '{path.with_suffix('.png').name}'"
+            )
         try:
             drawn.savefig(path, dpi=150, metadata=about.get(path.suffix.lower()))
         except OSError as error:
             raise ConfigurationError(f"cannot write '{path}': {error.strerror}") from error
 
 
-def figure(dataset: xarray.Dataset) -> Any:
+@contextmanager
+def own_style() -> Iterator[None]:
+    """Draw as we do, whatever style the user has set."""
+    import matplotlib.style
+
+    with (
+        matplotlib.style.context("default", after_reset=True),
+        matplotlib.rc_context({"svg.hashsalt": "terrafix", "axes.axisbelow": True}),
+    ):
+        yield
+
+
+def result_figure(dataset: xarray.Dataset) -> Figure:
+    """The figure of a result, which shows itself in a notebook.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is nothing to draw.
+    """
+    with own_style():
+        drawn = figure(dataset)
+    # of its own, a figure shows itself only beside pyplot
+    drawn._repr_png_ = partial(_png, drawn)  # type: ignore[attr-defined]
+    return drawn
+
+
+def _png(drawn: Figure) -> bytes:
+    with own_style(), BytesIO() as file:
+        drawn.savefig(file, format="png", dpi=90)
+        return file.getvalue()
+
+
+def figure(dataset: xarray.Dataset) -> Figure:
     """Build the figure of a result: of its evaluations if there are any, else of its signals.
 
     Raises
@@ -152,7 +190,7 @@ def _element_names(variable: xarray.DataArray) -> list[str]:
 
 def _evaluation_figure(
     dataset: xarray.Dataset, found: Mapping[str, Mapping[str, list[Panel]]]
-) -> Any:
+) -> Figure:
     from matplotlib.figure import Figure
 
     columns = max(len(quantities) for quantities in found.values())
@@ -313,7 +351,7 @@ def _messages(dataset: xarray.Dataset) -> set[str]:
     return {s for s in stamps if any(n == s or n.startswith(f"{s}.") for n in values)}
 
 
-def _signal_figure(dataset: xarray.Dataset, names: list[str]) -> Any:
+def _signal_figure(dataset: xarray.Dataset, names: list[str]) -> Figure:
     from matplotlib.figure import Figure
 
     columns = 1 if len(names) < 4 else 2

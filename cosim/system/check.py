@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +22,14 @@ from terrafix.cosim.basics.units import check_unit, conversion_factor
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.memory.fields import Field
+from terrafix.cosim.show.tables import Block, Shown
 from terrafix.cosim.system.dispersion import overridden
 from terrafix.cosim.system.flat import FlatSystem, Flattened, Record
 from terrafix.cosim.system.order import stepping_order
 
 
-@dataclass(frozen=True)
-class Plan:
+@dataclass(frozen=True, repr=False)
+class Plan(Shown):
     """A checked system: what the master runs.
 
     Attributes
@@ -49,6 +51,17 @@ class Plan:
     base: Fraction
     grid: Fraction
     notes: list[str]
+
+    def content(self) -> dict[str, Any]:
+        """Plain types for JSON, components in stepping order."""
+        from terrafix.cosim.system.display import plan_content
+
+        return plan_content(self.flat, self.order, self.base, self.notes)
+
+    def _shown(self) -> list[Block]:
+        from terrafix.cosim.system.display import plan_shown
+
+        return plan_shown(self.content())
 
 
 def check(system: Flattened, *, duration: Fraction | None = None, outside: bool = False) -> Plan:
@@ -259,13 +272,13 @@ def record_rate(flat: FlatSystem, record: Record) -> Rate:
         owners.append(flat.owner(path))
     if record.rate is not None:
         return record.rate
-    rates = {str(flat.components[o].rate): flat.components[o].rate for o in owners}
+    rates = {flat.components[o].rate for o in owners}
     if len(rates) > 1:
         raise RateError(
             f"record '{record.name}' watches components of different rates "
-            f"({', '.join(sorted(rates))})\n  give it a period of its own"
+            f"({', '.join(sorted(map(str, rates)))})\n  give it a period of its own"
         )
-    rate = next(iter(rates.values()))
+    (rate,) = rates
     if rate is None:
         raise RateError(f"record '{record.name}' watches a component without a rate")
     return rate
@@ -291,6 +304,9 @@ def _notes(flat: FlatSystem) -> Iterator[str]:
                     f"{source}: between its steps the last value is held"
                 )
     for path, component in flat.components.items():
+        for name in component.settings():
+            if not component.is_default(name) and (reason := component.idle(name)):
+                yield reason
         for note in component.capabilities.notes:
             yield f"'{path}': {note}"
     for connection in flat.connections:

@@ -136,6 +136,12 @@ class Dispersion:
         settings = component.settings()
         setting = settings.get(name)
         if isinstance(setting, Parameter):
+            reason = component.idle(name)
+            if reason is not None:
+                raise ConfigurationError(
+                    f"dispersion '{self.name}' feeds '{target}'\n  {reason}\n"
+                    "  choose otherwise, or leave it out"
+                )
             return setting
         state = component._declared.get(name)
         if isinstance(state, State) and np.dtype(state.field.dtype) == np.float64:

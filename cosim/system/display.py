@@ -1,40 +1,174 @@
-"""What a checked system and the installed component types consist of, as plain data and tables."""
+"""How a system looks to a person: what it consists of, what it lacks, and what a check found."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
-from rich import box
-from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from typing import Any, Protocol
 
 from terrafix.cosim.basics.clock import text_seconds
-from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.errors import TerrafixError
 from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.parameters import Setting
-from terrafix.cosim.declare.ports import Port
-from terrafix.cosim.declare.registry import component_entries, component_type, type_name
-from terrafix.cosim.system.check import Plan
+from terrafix.cosim.declare.registry import type_name
+from terrafix.cosim.show.tables import Block, Table, first, named
+from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.flat import Connection, FlatSystem, Flattened, Record
+
+MOST_ROWS = 12
+MOST_LINES = 6
+MOST_NAMES = 4
+
+# ---------------------------------------------------------------------- a system
+
+
+class Whole(Flattened, Protocol):
+    """Anything that is shown as a system: a `terrafix.System`."""
+
+    doc: str
+    duration: Fraction | None
+    members: int
+    seed: int
+    connections: list[Connection]
+    records: list[Record]
+    dispersions: list[Dispersion]
+
+    @property
+    def nodes(self) -> Mapping[str, Component | Whole]:
+        """Components and systems by name."""
+
+
+def system_shown(system: Whole) -> list[Block]:
+    """A system in whatever state: components, connections, and what it lacks."""
+    from rich.text import Text
+
+    parts = [_count(len(system.nodes), "component")]
+    parts.append(_count(len(system.connections), "connection"))
+    header = Text(f"System '{system.name}'", style="bold")
+    header.append(f": {', '.join(parts)}", style="not bold")
+    flight = [] if system.duration is None else [f"{text_seconds(system.duration)} s"]
+    flight += [_count(system.members, "member"), f"seed {system.seed}"]
+    shown: list[Block] = [header, Text(", ".join(flight))]
+    doc = system.doc.strip().partition("\n")[0]
+    shown += [Text(doc)] if doc else []
+    if system.nodes:
+        nodes, more = first(system.nodes.items(), MOST_ROWS)
+        rows = [_node_row(name, node) for name, node in nodes]
+        shown += ["", Table(["component", "type", "steps"], rows), *_and_more(more)]
+    if system.connections:
+        arrows, more = first(_arrows(system.connections), MOST_ROWS)
+        shown += ["", Table(["from", "to", "ports"], arrows), *_and_more(more)]
+    listed = [Text(line) for line in _lists(system)]
+    lacking, more = first(_lacking(system), MOST_LINES)
+    listed += [Text(f"missing: {line}", style="red") for line in lacking]
+    return [*shown, *([""] if listed else []), *listed, *_and_more(more)]
+
+
+def _and_more(count: int) -> list[Block]:
+    from rich.text import Text
+
+    return [Text(f"and {count} more", style="dim")] if count else []
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def _node_row(name: str, node: Component | Whole) -> list[str]:
+    if isinstance(node, Component):
+        return [name, type(node).__name__, str(node.rate or "-")]
+    return [name, f"System of {_count(len(node.nodes), 'component')}", ""]
+
+
+def _arrows(connections: Sequence[Connection]) -> list[list[str]]:
+    """Connections with the same ends in one row each; ports once where both ends agree."""
+    bundles: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for c in connections:
+        (source, _, output), (target, _, entry) = c.source.partition("."), c.target.partition(".")
+        text = output if output == entry else f"{output} -> {entry}"
+        delay = f" ({text_seconds(c.delay)} s late)" if c.delay else ""
+        bundles[source, target].append(text + delay)
+    return [[*ends, ", ".join(ports)] for ends, ports in bundles.items()]
+
+
+def _lists(system: Whole) -> Iterator[str]:
+    exposed = [f"{name} = {path}" for name, path in system.exposed.items()]
+    records = [
+        f"{r.name} ({_count(len(r.ports), 'port')}, {r.rate or 'with their component'})"
+        for r in system.records
+    ]
+    dispersions = [f"{d.name} ({d.kind}, of {named(d.targets, 2)})" for d in system.dispersions]
+    for title, items in (
+        ("exposes", exposed),
+        ("records", records),
+        ("disperses", dispersions),
+    ):
+        if items:
+            yield f"{title}: {named(items, MOST_NAMES)}"
+
+
+def _lacking(system: Whole) -> Iterator[str]:
+    """What must still be given before it can run."""
+    if not system.nodes:
+        yield "components"
+    driven = set(_driven(system))
+    for path, component in _leaves(system):
+        for name in component.missing_settings():
+            yield f"a value for '{path}.{name}': it takes {component.settings()[name].kind()}"
+        if component.rate is None:
+            yield f"a rate of '{path}'"
+        for name, port in component.inputs().items():
+            if not port.optional and f"{path}.{name}" not in driven:
+                yield f"a connection to '{path}.{name}'"
+    for c in system.connections:
+        for end in (c.source, c.target):
+            if _leaf(system, end) is None:
+                yield f"'{end}', which '{c}' names"
+
+
+def _leaves(system: Whole, prefix: str = "") -> Iterator[tuple[str, Component]]:
+    for name, node in system.nodes.items():
+        if isinstance(node, Component):
+            yield f"{prefix}{name}", node
+        else:
+            yield from _leaves(node, f"{prefix}{name}.")
+
+
+def _driven(system: Whole, *, exposed: bool = True) -> Iterator[str]:
+    """Inputs that are connected, or that the whole exposes to whoever contains it."""
+    ends = [c.target for c in system.connections] + list(system.exposed.values()) * exposed
+    yield from filter(None, (_leaf(system, end) for end in ends))
+    for name, node in system.nodes.items():
+        if not isinstance(node, Component):
+            yield from (f"{name}.{path}" for path in _driven(node, exposed=False))
+
+
+def _leaf(system: Whole, path: str) -> str | None:
+    try:
+        return system.resolve(path)[0]
+    except TerrafixError:
+        return None
+
 
 # ---------------------------------------------------------------------- a checked system
 
 
-def plan_content(plan: Plan) -> dict[str, Any]:
+def plan_content(
+    flat: FlatSystem, order: Sequence[str], base: Fraction, notes: Sequence[str]
+) -> dict[str, Any]:
     """Describe a checked system in plain types, its components in stepping order."""
-    flat = plan.flat
     return {
         "system": flat.name,
         "ok": True,
-        "base_step_s": float(plan.base),
-        "base_step": f"{text_seconds(plan.base)} s",
-        "order": list(plan.order),
+        "base_step_s": float(base),
+        "base_step": f"{text_seconds(base)} s",
+        "order": list(order),
         "components": {
-            path: {"type": type_name(type(flat.components[path])), "rate": _rate(flat, path)}
-            for path in plan.order
+            path: {
+                "type": type_name(type(flat.components[path])),
+                "rate": str(flat.components[path].rate),
+            }
+            for path in order
         },
         "connections": [
             {
@@ -45,173 +179,30 @@ def plan_content(plan: Plan) -> dict[str, Any]:
             }
             for c in flat.connections
         ],
-        "notes": list(plan.notes),
+        "notes": list(notes),
         "problems": [],
     }
 
 
-def _rate(flat: Any, path: str) -> str:
-    return str(flat.components[path].rate)
+def plan_shown(content: Mapping[str, Any]) -> list[Block]:
+    """Show what `plan_content` describes."""
+    from rich.text import Text
 
-
-def plan_tables(plan: Plan) -> list[Any]:
-    """Show a checked system to a person."""
-    flat = plan.flat
-    table = _table("", "component", "type", "steps")
-    for number, path in enumerate(plan.order, 1):
-        kind = type_name(type(flat.components[path]))
-        table.add_row(str(number), path, kind, escape(_rate(flat, path)))
-    shown: list[Any] = [
+    rows = [
+        [
+            str(number),
+            path,
+            content["components"][path]["type"],
+            content["components"][path]["rate"],
+        ]
+        for number, path in enumerate(content["order"], 1)
+    ]
+    return [
         Text(
-            f"{flat.name}: {len(plan.order)} components in stepping order, "
-            f"{len(flat.connections)} connections, base step {text_seconds(plan.base)} s"
+            f"{content['system']}: {len(rows)} components in stepping order, "
+            f"{len(content['connections'])} connections, base step {content['base_step']}"
         ),
-        table,
+        Table(["", "component", "type", "steps"], rows),
+        *(Text(f"note: {note}") for note in content["notes"]),
+        Text("ok", style="green"),
     ]
-    shown += [Text(f"note: {note}") for note in plan.notes]
-    return [*shown, Text("ok", style="green")]
-
-
-# ---------------------------------------------------------------------- component types
-
-
-def types_content() -> dict[str, Any]:
-    """List all installed component types with one line each."""
-    listed = []
-    for name, entry in sorted(component_entries().items()):
-        try:
-            doc = _first_line(component_type(name))
-        except ConfigurationError as error:  # one package that is broken hides no others
-            doc = " ".join(str(error).split())
-        listed.append({"type": name, "class": entry.value, "doc": doc})
-    return {"components": listed}
-
-
-def type_content(name: str) -> dict[str, Any]:
-    """Describe the parameters and ports of one component type.
-
-    Raises
-    ------
-    ConfigurationError
-        If there is no such type, or it cannot be imported.
-    """
-    kind = component_type(name)
-    ports = {n: p for n, p in kind._declared.items() if isinstance(p, Port)}
-    return {
-        "type": name,
-        "class": f"{kind.__module__}:{kind.__qualname__}",
-        "doc": inspect.cleandoc(kind.__doc__ or ""),
-        "default_rate": None if kind.default_rate is None else str(kind.default_rate),
-        "parameters": [_setting_content(n, s) for n, s in kind.settings().items()],
-        "ports": [_port_content(n, p) for n, p in ports.items()],
-    }
-
-
-def _setting_content(name: str, setting: Setting[Any]) -> dict[str, Any]:
-    default = None
-    if not setting.required:
-        default = setting.write(setting.read(setting.default, where=f"default of '{name}'"))
-    return {
-        "name": name,
-        "kind": setting.kind(),
-        "required": setting.required,
-        "default": default,
-        "doc": setting.doc,
-    }
-
-
-def _port_content(name: str, port: Port[Any]) -> dict[str, Any]:
-    fields = [
-        {
-            "name": n,
-            "shape": list(f.shape),
-            "unit": f.unit if isinstance(f.unit, str) else list(f.unit),
-            "frame": f.frame,
-            "dtype": str(np.dtype(f.dtype)),
-            "ragged": f.ragged,
-            "labels": list(f.labels),
-            "doc": f.doc,
-        }
-        for n, f in port.fields.items()
-    ]
-    content: dict[str, Any] = {
-        "name": name,
-        "direction": "input" if port.is_input else "output",
-        "kind": "window" if port.window else port.kind,
-        "fields": fields,
-        "doc": port.doc,
-    }
-    if port.is_input:
-        content |= {"at": port.at, "optional": port.optional, "default": port.default}
-    if port.kind == "message" and port.is_input:
-        content["queue"] = port.queue
-    return content
-
-
-def _first_line(kind: type[Component]) -> str:
-    own = vars(kind).get("__doc__") or ""
-    return inspect.cleandoc(own).partition("\n")[0]
-
-
-# ---------------------------------------------------------------------- tables of types
-
-
-def types_tables(content: Mapping[str, Any]) -> list[Any]:
-    """Show what `types_content` lists."""
-    if not content["components"]:
-        return [Text("no component types are installed")]
-    table = _table("type", "what it is")
-    for kind in content["components"]:
-        table.add_row(kind["type"], escape(kind["doc"]))
-    return [table]
-
-
-def type_tables(content: Mapping[str, Any]) -> list[Any]:
-    """Show what `type_content` describes."""
-    shown: list[Any] = [
-        Text(f"{content['type']}  ({content['class']})", style="bold"),
-        Text(content["doc"]),
-        Text(f"\nsteps {content['default_rate'] or 'at the rate that its system gives'}"),
-    ]
-    if content["parameters"]:
-        table = _table("parameter", "takes", "default", "meaning")
-        for p in content["parameters"]:
-            default = "required" if p["required"] else str(p["default"])
-            table.add_row(*(escape(t) for t in (p["name"], p["kind"], default, p["doc"])))
-        shown += [Text(), table]
-    if content["ports"]:
-        table = _table("port", "", "shape", "unit", "frame", "read at", "meaning")
-        for port in content["ports"]:
-            for row in _port_rows(port):
-                table.add_row(*(escape(t) for t in row))
-        shown += [Text(), table]
-    return shown
-
-
-def _port_rows(port: Mapping[str, Any]) -> list[list[str]]:
-    kind = "" if port["kind"] == "signal" else f" {port['kind']}"
-    read = ""
-    if port["direction"] == "input":
-        read = f"{port['at']}{', optional' if port['optional'] else ''}"
-    fields = port["fields"]
-    rows = []
-    if fields[0]["name"]:
-        rows.append([port["name"], f"{port['direction']}{kind}", "", "", "", read, port["doc"]])
-    for field in fields:
-        unit = field["unit"] if isinstance(field["unit"], str) else ", ".join(field["unit"])
-        shape = " x ".join("any" if n is None else str(n) for n in field["shape"]) or "scalar"
-        dtype = "" if field["dtype"] == "float64" else f" {field['dtype']}"
-        facts = [f"{shape}{dtype}{' at most' if field['ragged'] else ''}", unit]
-        facts.append(field["frame"] or "")
-        if field["name"]:
-            rows.append([f"  .{field['name']}", "", *facts, "", field["doc"]])
-        else:
-            rows.append([port["name"], f"{port['direction']}{kind}", *facts, read, port["doc"]])
-    return rows
-
-
-def _table(*headers: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for header in headers:
-        table.add_column(header, overflow="fold")
-    return table

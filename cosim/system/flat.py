@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, Protocol
+from typing import Protocol
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import WiringError, nearest
@@ -44,7 +44,7 @@ class FlatSystem:
     records: list[Record] = field(default_factory=list)
     dispersions: list[Dispersion] = field(default_factory=list)
 
-    def port(self, path: str) -> Port[Any]:
+    def port(self, path: str) -> Port[object]:
         """The port at ``"component.port"``; WiringError if there is none."""
         owner, _, name = path.rpartition(".")
         if not owner:
@@ -54,7 +54,7 @@ class FlatSystem:
                 f"there is no component '{owner}' in '{path}'\n"
                 f"  {nearest(owner, self.components, what='components')}"
             )
-        return self.components[owner][name].component.ports[name]  # type: ignore[no-any-return]
+        return self.components[owner][name].declared
 
     def owner(self, path: str) -> str:
         """Path of the component that a port belongs to."""
@@ -68,7 +68,7 @@ class Flattened(Protocol):
     exposed: dict[str, str]
     """Paths of ports, by the names they are exposed under."""
 
-    def resolve(self, path: str) -> tuple[str, Port[Any]]:
+    def resolve(self, path: str) -> tuple[str, Port[object]]:
         """Follow exposed ports down to (path of the component's port, port)."""
 
     def flatten(self) -> FlatSystem:

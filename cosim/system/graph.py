@@ -9,18 +9,21 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from terrafix.cosim.basics.clock import text_seconds
+from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.registry import type_name
-from terrafix.cosim.system.check import check
+from terrafix.cosim.system.check import Plan, check
 from terrafix.cosim.system.flat import Connection, FlatSystem, Flattened
 from terrafix.cosim.system.order import is_feedthrough
 
 BOX, GAP, LINE = 2.3, 2.9, 0.26  # width of a box, gap between layers, height of a line [inch]
 STYLES = {"signal": "-", "message": "--", "shared": ":"}
+DIAGRAMS = (".svg", ".png", ".mmd")
 COLORS = {"signal": "#33475b", "message": "#b3541e", "shared": "#2e7d4f"}
 
 
@@ -66,15 +69,64 @@ def _title(flat: FlatSystem, path: str) -> tuple[str, str, str]:
     return path, type_name(type(component)), str(component.rate)
 
 
-def mermaid(system: Flattened) -> str:
-    """The system as a Mermaid flowchart.
+class Diagram:
+    """A system as it was when drawn: a picture in a notebook, Mermaid text elsewhere.
 
     Raises
     ------
     SystemCheckError
         If the system has problems.
     """
-    plan = check(system)
+
+    def __init__(self, system: Flattened) -> None:
+        self.plan = check(system)
+        self.mermaid = _mermaid(self.plan)
+
+    def __repr__(self) -> str:
+        return self.mermaid.rstrip()
+
+    def _repr_svg_(self) -> str:
+        return self.svg().replace("<svg ", '<svg style="max-width:100%;height:auto" ', 1)
+
+    def svg(self) -> str:
+        """The picture as SVG."""
+        drawn = BytesIO()
+        self._draw(drawn, "svg")
+        return drawn.getvalue().decode()
+
+    def _draw(self, target: Path | BytesIO, kind: str) -> None:
+        """The same system gives the same file."""
+        from matplotlib import rc_context
+
+        about = {"Date": None} if kind == "svg" else {}
+        with rc_context({"svg.hashsalt": "terrafix"}):
+            _picture(self.plan).savefig(target, format=kind, dpi=130, metadata=about)
+
+    def save(self, path: str | Path) -> None:
+        """Draw to an .svg or .png file, or write Mermaid text to an .mmd file.
+
+        Raises
+        ------
+        ConfigurationError
+            If the file is of another kind, or cannot be written.
+        """
+        path = Path(path)
+        kind = path.suffix.lower()
+        if kind not in DIAGRAMS:
+            raise ConfigurationError(
+                f"'{path}' is no {' or '.join(DIAGRAMS)} file\n"
+                f"  its ending says what is written: name it '{path.with_suffix('.svg').name}'"
+            )
+        try:
+            if kind == ".mmd":
+                path.write_text(self.mermaid, encoding="utf-8")
+            else:
+                self._draw(path, kind.removeprefix("."))
+        except OSError as error:
+            raise ConfigurationError(f"cannot write '{path}': {error.strerror}") from error
+
+
+def _mermaid(plan: Plan) -> str:
     names = {path: f"c{i}" for i, path in enumerate(plan.order)}
     lines = ["flowchart LR"]
     for path in plan.order:
@@ -187,17 +239,10 @@ def _stack(boxes: dict[Any, _Box], column: list[Any]) -> None:
         top -= height
 
 
-def draw(system: Flattened, path: str | Path) -> None:
-    """Draw the system to an .svg or .png file.
-
-    Raises
-    ------
-    SystemCheckError
-        If the system has problems.
-    """
+def _picture(plan: Plan) -> Any:
+    """The figure of a checked system."""
     from matplotlib.figure import Figure
 
-    plan = check(system)
     found = arrows(plan.flat)
     boxes, columns = _place(plan.order, found)
     back = [a for a in found if a.back]
@@ -210,7 +255,7 @@ def draw(system: Flattened, path: str | Path) -> None:
     axes.set_xlim(-0.6, right + 0.6)
     axes.set_ylim(bottom - 0.1, high + 0.1)
     axes.set_axis_off()
-    axes.text(-0.3, high - 0.3, system.name, fontsize=15, weight="bold")
+    axes.text(-0.3, high - 0.3, plan.flat.name, fontsize=15, weight="bold")
     forward = [a for a in found if not a.back]
     for number, arrow in enumerate(forward):
         _draw_forward(axes, boxes, number, arrow)
@@ -218,12 +263,7 @@ def draw(system: Flattened, path: str | Path) -> None:
         _draw_back(axes, boxes, lane, arrow, low - 0.45 * lane)
     for name in plan.order:
         _draw_box(axes, boxes[name], _title(plan.flat, name))
-    figure.savefig(path, dpi=130, metadata=_metadata(Path(path)))
-
-
-def _metadata(path: Path) -> dict[str, None]:
-    """Leave the date out: the same system gives the same picture."""
-    return {"Date": None} if path.suffix == ".svg" else {}
+    return figure
 
 
 def _left(box: _Box) -> float:

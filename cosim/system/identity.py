@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from terrafix.cosim.basics.clock import text_seconds
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.registry import component_entries, type_name
 from terrafix.cosim.system.check import Plan
 
 
@@ -14,8 +16,8 @@ def configuration(plan: Plan) -> dict[str, Any]:
     return {
         "components": {
             path: {
-                "type": f"{type(c).__module__}.{type(c).__qualname__}",
-                "rate": str(c.rate),
+                "type": _type(type(c)),
+                "rate": None if c.rate is None else c.rate.identity(),
                 **{n: s.write(c.setting(n)) for n, s in c.settings().items() if n in c._base},
             }
             for path, c in flat.components.items()
@@ -24,7 +26,10 @@ def configuration(plan: Plan) -> dict[str, Any]:
             f"{c}" + (f" (delay {text_seconds(c.delay)} s)" if c.delay else "")
             for c in flat.connections
         ),
-        "records": {r.name: {"ports": list(r.ports), "rate": str(r.rate)} for r in flat.records},
+        "records": {
+            r.name: {"ports": list(r.ports), "rate": None if r.rate is None else r.rate.identity()}
+            for r in flat.records
+        },
         "dispersions": {
             d.name: {"kind": d.kind, "spread": str(d.spread), "to": list(d.targets)}
             | ({"design": d.design} if d.design != "random" else {})
@@ -32,6 +37,12 @@ def configuration(plan: Plan) -> dict[str, Any]:
             for d in flat.dispersions
         },
     }
+
+
+def _type(kind: type[Component]) -> str:
+    """The registered name, which outlives moves of the class; else where the class stands."""
+    name = type_name(kind)
+    return name if name in component_entries() else f"{kind.__module__}.{kind.__qualname__}"
 
 
 _OTHER = {"system": "another system", "seed": "another seed", "members": "other members"}

@@ -13,7 +13,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import Any, Self, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Self, TypeAlias, TypeVar, overload
 
 from terrafix.cosim.basics.clock import Exact, Rate, seconds
 from terrafix.cosim.basics.errors import (
@@ -25,16 +26,30 @@ from terrafix.cosim.basics.errors import (
 )
 from terrafix.cosim.declare.component import Component, PortRef
 from terrafix.cosim.declare.ports import Port
+from terrafix.cosim.show.tables import Block, Shown
 from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.cosim.system.flat import Connection, FlatSystem, Record
 from terrafix.cosim.system.wiring import check_connection
 
+if TYPE_CHECKING:
+    from terrafix.cosim.system.check import Plan
+    from terrafix.cosim.system.graph import Diagram
+
 TABLES = frozenset({"component", "wiring", "expose", "record", "dispersion", "choice"})
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 Node = TypeVar("Node", bound="Component | System")
+End: TypeAlias = "PortRef | Component | System | str"
+"""A port or its path; what ``system[...]`` gives is taken, and refused where it is no port."""
 
 
-class System:
+class Nodes(dict[str, "Component | System"]):
+    """Components and systems by name; shown by the names of their classes."""
+
+    def __repr__(self) -> str:
+        return f"{{{', '.join(f'{n!r}: {type(node).__name__}' for n, node in self.items())}}}"
+
+
+class System(Shown):
     """Components and what connects them.
 
     Parameters
@@ -65,7 +80,7 @@ class System:
         self.duration = None if duration is None else _positive(duration, "duration")
         self.members = members
         self.seed = seed
-        self.nodes: dict[str, Component | System] = {}
+        self.nodes: dict[str, Component | System] = Nodes()
         self.connections: list[Connection] = []
         self.exposed: dict[str, str] = {}
         self.records: list[Record] = []
@@ -117,23 +132,49 @@ class System:
         self.nodes[name] = node
         return node
 
-    def __getitem__(self, port: str) -> PortRef:
-        """Name an exposed port of this system: ``nav["fix"]``."""
+    def __getitem__(self, name: str) -> Component | System | PortRef:
+        """Name an exposed port, a component, or a port of one.
+
+        ``nav["fix"]``, ``system["orbit"]``, ``system["orbit.r_e"]``; where an exposed port and a
+        component have one name, the port.
+
+        Raises
+        ------
+        WiringError
+            If there is nothing of that name.
+        """
+        if name in self.exposed:
+            return self._exposed(name)
+        head, dot, rest = name.partition(".")
+        if head not in self.nodes:
+            raise WiringError(
+                f"system '{self.name}' has no component and exposes no port '{head}'\n"
+                f"  {nearest(head, [*self.nodes, *self.exposed], what='components and ports')}"
+            )
+        node = self.nodes[head]
+        return node[rest] if dot else node
+
+    def _exposed(self, port: str) -> PortRef:
         if port not in self.exposed:
             raise WiringError(
                 f"system '{self.name}' exposes no port '{port}'\n"
                 f"  {nearest(port, self.exposed, what='exposed ports')}"
             )
-        return PortRef(self, port)
+        return PortRef(self, port, self.resolve(self.exposed[port])[1])
 
-    def expose(self, name: str, port: PortRef | str) -> None:
+    def _ipython_key_completions_(self) -> list[str]:
+        ports = {n: node.ports for n, node in self.nodes.items() if isinstance(node, Component)}
+        inner = [f"{name}.{port}" for name, own in ports.items() for port in own]
+        return [*self.nodes, *self.exposed, *inner]
+
+    def expose(self, name: str, port: End) -> None:
         """Make a port of a component a port of this system."""
         _checked_name(name, "port")
         path = self._path(port)
         self.resolve(path)
         self.exposed[name] = path
 
-    def connect(self, source: PortRef | str, target: PortRef | str, *, delay: Exact = 0) -> None:
+    def connect(self, source: End, target: End, *, delay: Exact = 0) -> None:
         """Connect an output to an input, optionally with a delay [s].
 
         Raises
@@ -179,7 +220,7 @@ class System:
     def record(
         self,
         name: str,
-        ports: PortRef | str | Sequence[PortRef | str],
+        ports: End | Sequence[End],
         *,
         period: Exact | None = None,
         rate: Rate | None = None,
@@ -190,7 +231,7 @@ class System:
             raise ConfigurationError(f"system '{self.name}' has a record '{name}' already")
         if period is not None:
             rate = Rate(period)
-        listed = [ports] if isinstance(ports, PortRef | str) else ports
+        listed = [ports] if isinstance(ports, PortRef | Component | System | str) else ports
         paths = tuple(self._path(p) for p in listed)
         if not paths:
             raise ConfigurationError(f"record '{name}' names no ports")
@@ -222,6 +263,13 @@ class System:
             if name not in (c.source.split(".")[0], c.target.split(".")[0])
         ]
 
+    def _all_nodes(self, prefix: str = "") -> Iterator[tuple[str, Component | System]]:
+        """Yield the path of everything within, and it."""
+        for name, node in self.nodes.items():
+            yield f"{prefix}{name}", node
+            if isinstance(node, System):
+                yield from node._all_nodes(f"{prefix}{name}.")
+
     def _systems(self) -> Iterator[System]:
         """Yield this system and all systems within."""
         yield self
@@ -242,7 +290,7 @@ class System:
         WiringError
             If a port that is read is missing or does not fit.
         """
-        nodes, connections = dict(self.nodes), list(self.connections)
+        nodes, connections = Nodes(self.nodes), list(self.connections)
         self.remove(name)
         try:
             self.add(node, name)
@@ -261,21 +309,21 @@ class System:
             raise
         return node
 
-    def _path(self, port: PortRef | str) -> str:
+    def _path(self, port: End) -> str:
         if isinstance(port, str):
             return port
         if not isinstance(port, PortRef):
             raise WiringError(
                 f'{type(port).__name__} is no port\n  name one of its ports: part["port"]'
             )
-        for name, node in self.nodes.items():
+        for path, node in self._all_nodes():
             if node is port.component:
-                return f"{name}.{port.port}"
+                return f"{path}.{port.port}"
         raise WiringError(f"'{port}' belongs to no component of system '{self.name}'; add it first")
 
     # ------------------------------------------------------------------ reading
 
-    def resolve(self, path: str) -> tuple[str, Port[Any]]:
+    def resolve(self, path: str) -> tuple[str, Port[object]]:
         """Follow exposed ports down to (path of the component's port, port).
 
         Raises
@@ -296,13 +344,12 @@ class System:
         if isinstance(node, System):
             inner = node.exposed.get(rest[0]) if len(rest) == 1 else ".".join(rest)
             if inner is None:
-                node[rest[0]]  # raises: names what is exposed
-                raise AssertionError
+                raise AssertionError(node._exposed(rest[0]))  # it raises: names what is exposed
             leaf, port = node.resolve(inner)
             return f"{head}.{leaf}", port
         if len(rest) != 1:
             raise WiringError(f"'{path}' is no port; write 'component.port'")
-        return path, node[rest[0]].component.ports[rest[0]]
+        return path, node[rest[0]].declared
 
     def find(self, path: str) -> Component:
         """The component at a path; ConfigurationError if there is none."""
@@ -324,6 +371,54 @@ class System:
                 return path
 
         return Record(record.name, tuple(leaf(p) for p in record.ports), record.rate)
+
+    def check(self, duration: Exact | None = None) -> Plan:
+        """Check the system whole, and give what it comes down to: order, base step, notes.
+
+        Parameters
+        ----------
+        duration : exact time, optional
+            Of the run that is meant [s], the system's own if absent: recordings that end before
+            it are found too.
+
+        Raises
+        ------
+        SystemCheckError
+            With every problem found.
+        """
+        from terrafix.cosim.system.check import check
+
+        length = self.duration if duration is None else _positive(duration, "duration")
+        return check(self, duration=length)
+
+    @overload
+    def graph(self, path: None = None) -> Diagram: ...
+    @overload
+    def graph(self, path: str | Path) -> None: ...
+    def graph(self, path: str | Path | None = None) -> Diagram | None:
+        """Draw the system: to an .svg or .png file, or as Mermaid text to an .mmd file.
+
+        Without a file: a picture in a notebook, Mermaid text elsewhere.
+
+        Raises
+        ------
+        SystemCheckError
+            If the system has problems.
+        ConfigurationError
+            If the file is of another kind, or cannot be written.
+        """
+        from terrafix.cosim.system.graph import Diagram
+
+        diagram = Diagram(self)
+        if path is None:
+            return diagram
+        diagram.save(path)
+        return None
+
+    def _shown(self) -> list[Block]:
+        from terrafix.cosim.system.display import system_shown
+
+        return system_shown(self)
 
     def flatten(self) -> FlatSystem:
         """Resolve nesting: every component by path, every connection between their ports."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, WiringError
-from terrafix.cosim.basics.units import conversion_factor
+from terrafix.cosim.basics.units import conversion_factor, difference
 from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.memory.fields import Field
 
@@ -51,7 +51,7 @@ def _field_problem(name: str, source: Field, target: Field) -> str | None:
     except ConfigurationError as error:
         return f"{prefix}{error}"
     if factor is None:
-        return f"{prefix}the units differ: {source.unit_text()} is not {target.unit_text()}"
+        return f"{prefix}{_units_differ(source, target)}"
     if source.frame != target.frame:
         return (
             f"{prefix}the frames differ: {source.frame or 'none'} is not {target.frame or 'none'}"
@@ -62,6 +62,12 @@ def _field_problem(name: str, source: Field, target: Field) -> str | None:
             f"declare both sides in {source.unit_text()} or in {target.unit_text()}"
         )
     return None
+
+
+def _units_differ(source: Field, target: Field) -> str:
+    if isinstance(source.unit, str) and isinstance(target.unit, str):
+        return difference(source.unit, target.unit)
+    return f"the units differ: {source.unit_text()} is not {target.unit_text()}"
 
 
 def field_factor(source: Field, target: Field) -> FloatArray | None:

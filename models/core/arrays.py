@@ -1,4 +1,4 @@
-"""The alias for arrays of real numbers, and named arrays in files of NumPy (.npz).
+"""Names of array types, and named arrays in files of NumPy (.npz).
 
 Files are read with errors that say what is wrong with the file.
 """
@@ -14,7 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-"""The one alias for arrays of real numbers."""
+"""Real numbers."""
+Single = NDArray[np.float32]
+"""Real numbers in single precision: pictures, heights."""
+ComplexArray = NDArray[np.complex64]
+"""Complex numbers in single precision: echo."""
 
 
 def read_arrays(

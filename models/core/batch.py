@@ -43,7 +43,7 @@ def over_members(expression: Callable[..., Any], *shapes: Shape) -> Callable[...
     """
 
     @cache
-    def build() -> tuple[Any, list[Shape], bool]:
+    def build() -> tuple[_Evaluator, list[Shape], bool]:
         flat = [ca.SX.sym(f"a{i}", prod(shape)) for i, shape in enumerate(shapes)]
         arguments = [
             ca.reshape(a, shape[1], shape[0]).T if len(shape) == 2 else a
@@ -54,13 +54,13 @@ def over_members(expression: Callable[..., Any], *shapes: Shape) -> Callable[...
         results = [ca.SX(r) for r in (result if several else (result,))]
         columns = [ca.densify(ca.vec(r.T)) for r in results]
         function = ca.Function("over_members", flat, columns, {"cse": True})
-        return function, [_numpy_shape(r) for r in results], several
+        return _Evaluator(function), [_numpy_shape(r) for r in results], several
 
     name = getattr(expression, "__name__", "function")
 
     @wraps(expression)
     def evaluate(*arrays: ArrayLike) -> Any:
-        function, result_shapes, several = build()
+        evaluator, result_shapes, several = build()
         if len(arrays) != len(shapes):
             raise ValueError(f"{name} takes {len(shapes)} arrays, got {len(arrays)}")
         given = [np.asarray(a, dtype=np.float64) for a in arrays]
@@ -75,7 +75,7 @@ def over_members(expression: Callable[..., Any], *shapes: Shape) -> Callable[...
             np.ascontiguousarray(np.broadcast_to(a, leading + shape).reshape(n, prod(shape)))
             for a, shape in zip(given, shapes, strict=True)
         ]
-        flat = _evaluated(function, rows, [prod(shape) for shape in result_shapes], n)
+        flat = evaluator(rows, [prod(shape) for shape in result_shapes], n)
         results = tuple(
             r.reshape(leading + shape) for r, shape in zip(flat, result_shapes, strict=True)
         )
@@ -84,37 +84,42 @@ def over_members(expression: Callable[..., Any], *shapes: Shape) -> Callable[...
     return evaluate
 
 
-_asked: dict[tuple[int, int], Any] = {}
-_MOST_MAPS = 64
+_MOST_MAPS = 8
 
 
-def _evaluated(function: Any, rows: list[Any], sizes: list[int], n: int) -> list[Any]:
-    """Rows of results (n, size) from rows of arguments.
+class _Evaluator:
+    """A function of single columns, evaluated on rows of them.
 
     A number of members that was asked for before gets a function of its own, which reads and
     writes the rows where they lie; making one takes longer than a single evaluation.
     """
-    if not n:
-        return [np.empty((0, size)) for size in sizes]
-    key = (id(function), n)
-    if key not in _asked:
-        if len(_asked) >= _MOST_MAPS:
-            _asked.clear()
-        _asked[key] = None
-        raw = function.call([ca.DM(r.T) for r in rows])
-        return [np.ascontiguousarray(r.full().T) for r in raw]
-    if _asked[key] is None:
-        _asked[key] = function.map(n)
-    results: list[Any] = [np.empty((n, size)) for size in sizes]
-    buffer, evaluate = _asked[key].buffer()
-    for i, row in enumerate(rows):
-        buffer.set_arg(i, memoryview(row.reshape(-1)))
-    for i, result in enumerate(results):
-        buffer.set_res(i, memoryview(result.reshape(-1)))
-    evaluate()
-    if buffer.ret():
-        raise ValueError(f"'{function.name()}' failed")
-    return results
+
+    def __init__(self, function: Any) -> None:
+        self._function = function
+        self._maps: dict[int, Any] = {}  # by number of members; None where asked for once
+
+    def __call__(self, rows: list[Any], sizes: list[int], n: int) -> list[Any]:
+        """Rows of results (n, size) from rows of arguments."""
+        if not n:
+            return [np.empty((0, size)) for size in sizes]
+        if n not in self._maps:
+            if len(self._maps) >= _MOST_MAPS:
+                self._maps.clear()
+            self._maps[n] = None
+            raw = self._function.call([ca.DM(r.T) for r in rows])
+            return [np.ascontiguousarray(r.full().T) for r in raw]
+        if self._maps[n] is None:
+            self._maps[n] = self._function.map(n)
+        results: list[Any] = [np.empty((n, size)) for size in sizes]
+        buffer, evaluate = self._maps[n].buffer()
+        for i, row in enumerate(rows):
+            buffer.set_arg(i, memoryview(row.reshape(-1)))
+        for i, result in enumerate(results):
+            buffer.set_res(i, memoryview(result.reshape(-1)))
+        evaluate()
+        if buffer.ret():
+            raise ValueError(f"'{self._function.name()}' failed")
+        return results
 
 
 def _numpy_shape(expression: Any) -> Shape:

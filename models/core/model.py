@@ -10,7 +10,9 @@ A model is the map of one step of length :math:`\Delta t`,
 with states :math:`x`, inputs :math:`u`, parameters :math:`p` and standard normal noise
 :math:`w`. Outputs are functions of the state *at the end* of the step, as in FMI; at the start
 they are :math:`g(x_0, u, p, w, 0)`. Continuous models give :math:`\dot x` instead of :math:`x^+`
-and are integrated over the step by the classical Runge-Kutta method of order four.
+and are integrated over the step by the classical Runge-Kutta method of order four. The symbol of
+time is the time *at the end* of the step in outputs and next states, and the running time in
+derivatives; inputs, parameters and noise are held.
 """
 
 from __future__ import annotations
@@ -31,22 +33,22 @@ Symbols = Mapping[str, Any]
 """Names to CasADi SX symbols or expressions (CasADi carries no type information)."""
 
 
-def rk4(derivative: Callable[[Any], Any], x: Any, dt: Any) -> Any:
+def rk4(derivative: Callable[[Any, Any], Any], x: Any, dt: Any) -> Any:
     r"""One step of the classical fourth-order Runge-Kutta method.
 
     Parameters
     ----------
     derivative : callable
-        Maps a state to :math:`\dot x`, same shape.
+        Maps the time since the start of the step [s] and a state to :math:`\dot x`, same shape.
     x : SX or ndarray, shape (n,)
         State at the start of the step.
     dt : SX or float
         Length of the step [s].
     """
-    k1 = derivative(x)
-    k2 = derivative(x + dt / 2 * k1)
-    k3 = derivative(x + dt / 2 * k2)
-    k4 = derivative(x + dt * k3)
+    k1 = derivative(0.0, x)
+    k2 = derivative(dt / 2, x + dt / 2 * k1)
+    k3 = derivative(dt / 2, x + dt / 2 * k2)
+    k4 = derivative(dt, x + dt * k3)
     return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
@@ -83,7 +85,7 @@ class Model:
     step : SX symbol, optional
         Length of the step [s].
     time : SX symbol, optional
-        Time at the end of the step [s].
+        Time at the end of the step; in `derivatives`, the time they are taken at [s].
     jacobians : sequence of (str, str)
         Pairs (output, input, state or parameter) to be offered by `jacobian`.
 
@@ -150,6 +152,21 @@ class Model:
             clock,
         ]
 
+    def uses(self, parameter: str) -> bool:
+        """Whether any expression depends on a parameter; false if the model has none of that name.
+
+        A choice (two-body gravity, say) may leave a parameter (J2) without any effect.
+        """
+        if parameter not in self.parameters:
+            return False
+        symbol = ca.vec(self.parameters[parameter])
+        expressions = [
+            ca.vec(ca.densify(ca.SX(e)))
+            for kind in (self.outputs, self.next, self.derivatives, self.initial)
+            for e in kind.values()
+        ]
+        return bool(expressions) and bool(ca.depends_on(ca.vertcat(*expressions), symbol))
+
     def shape(self, name: str) -> tuple[int, ...]:
         """Shape of a named quantity as NumPy sees it: ``(n,)`` for a column, else ``(n, m)``."""
         for group in (*self._symbol_groups(), dict(self.outputs)):
@@ -172,10 +189,17 @@ class Model:
             x = ca.vertcat(*(ca.vec(self.states[k]) for k in keys))
             xdot = ca.vertcat(*(ca.vec(ca.SX(self.derivatives[k])) for k in keys))
             offsets = np.cumsum([0] + [self.states[k].numel() for k in keys])
-            end = rk4(lambda value: ca.substitute(xdot, x, value), x, self.step)
+            end = rk4(lambda since, value: self._rate(xdot, x, since, value), x, self.step)
             for i, k in enumerate(keys):
                 advanced[k] = ca.reshape(end[offsets[i] : offsets[i + 1]], *self.states[k].shape)
         return advanced
+
+    def _rate(self, xdot: Any, x: Any, since: Any, value: Any) -> Any:
+        """Put a state and the time since the start of the step into the derivatives."""
+        if self.time is None:
+            return ca.substitute(xdot, x, value)
+        now = self.time - self.step + since  # `time` is that of the end of the step
+        return ca.substitute(xdot, ca.vertcat(x, self.time), ca.vertcat(value, now))
 
     def _function(self, name: str, outputs: Symbols, *, drop_states: bool = False) -> Any:
         """Build a function of flat row-major inputs, states, parameters, noise and clock."""
@@ -289,8 +313,7 @@ class Model:
             value = np.asarray(values.get(name, 0.0), dtype=np.float64)
             size = function.numel_in(i)
             arguments.append(np.full(size, value) if value.ndim == 0 else value.reshape(size))
-        result = function(*arguments)
-        return list(result) if isinstance(result, tuple) else [result]
+        return list(function.call(arguments))  # a list, also where there are no arguments
 
     def jacobian_expression(self, output: str, wrt: str) -> Any:
         """Symbolic derivative of an output by a declared quantity, both in row-major order."""

@@ -163,7 +163,7 @@ def _mechanized(r: Any, v: Any, delta_v_e: Any, gravity: Any, rate: Any, dt: Any
     without it: of second order in the sensed acceleration, and no division by the step.
     """
 
-    def derivative(x: Any) -> Any:
+    def derivative(_: Any, x: Any) -> Any:
         return ca.vertcat(x[3:], gravity(x[:3]) - 2 * earth_rate_cross(rate, x[3:]))
 
     end = rk4(derivative, ca.vertcat(r, v + delta_v_e / 2), dt)

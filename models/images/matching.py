@@ -35,9 +35,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.arrays import FloatArray, Single
 
 KINDS = ("similarity", "affine")
 """Transforms between an image and a reference."""
@@ -146,19 +146,19 @@ class Searchable:
         self.amplitude = image
 
     @cached_property
-    def nepers(self) -> NDArray[np.float32]:
+    def nepers(self) -> Single:
         """Logarithm of amplitude; what is nearly black is lifted to a thousandth of the mean."""
         floor = 1e-3 * max(float(self.amplitude.mean()), 1e-30)
         return np.log(np.maximum(self.amplitude, np.float32(floor)))
 
     @cached_property
-    def smooth(self) -> NDArray[np.float32]:
+    def smooth(self) -> Single:
         """What is correlated: details, without trends that correlate wherever they are moved."""
         fine, broad = (cv2.GaussianBlur(self.nepers, (0, 0), s) for s in (_SMOOTH, _BROAD))
         return np.asarray(fine - broad)
 
     @cached_property
-    def features(self) -> tuple[FloatArray, NDArray[np.float32]]:
+    def features(self) -> tuple[FloatArray, Single]:
         """Row, column, size, angle [rad] of features (n, 4), and what they look like (n, 128)."""
         blurred = cv2.GaussianBlur(self.nepers, (0, 0), _BLUR)
         low, high = np.percentile(blurred, [0.5, 99.5])
@@ -287,7 +287,7 @@ def _shared_transform(
 
 def _warped(
     reference: Searchable, transform: FloatArray, shape: tuple[int, int]
-) -> tuple[NDArray[np.float32], float]:
+) -> tuple[Single, float]:
     """Reference in the frame of the image, and the share of the image that it covers."""
     xy = np.ascontiguousarray(transform[::-1][:, [1, 0, 2]])
     size = (shape[1], shape[0])
@@ -317,7 +317,7 @@ def _aligned(
     return np.ascontiguousarray(found[::-1][:, [1, 0, 2]], np.float64), float(correlation)
 
 
-def _block_correlations(image: NDArray[np.float32], warped: NDArray[np.float32]) -> FloatArray:
+def _block_correlations(image: Single, warped: Single) -> FloatArray:
     """Correlation of every block with the warped reference, at shifts up to `_REACH` either way.
 
     Shape (n_blocks, 2 * _REACH + 1, 2 * _REACH + 1), not normalized: their sum is the whole's.
@@ -329,7 +329,7 @@ def _block_correlations(image: NDArray[np.float32], warped: NDArray[np.float32])
     return np.array(surfaces, np.float64)
 
 
-def _blocks(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+def _blocks(image: Single) -> list[Single]:
     return [
         np.ascontiguousarray(block)
         for band in np.array_split(image, _BLOCKS, 0)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from terrafix.models.core.arrays import FloatArray, read_arrays
+from terrafix.models.core.arrays import FloatArray, Single, read_arrays
 from terrafix.models.geometry.geodesy import geodetic
 from terrafix.models.geometry.geolocation import Height, ground_point_on_terrain
 from terrafix.models.motion.arc import OrbitArc
@@ -20,7 +20,7 @@ from terrafix.models.radar.echo import ideal_image
 from terrafix.models.radar.focusing import Image
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.multilook import detected, full_index, multilook_index
-from terrafix.models.radar.scene import Scene, Single
+from terrafix.models.radar.scene import Scene
 
 KEYS = ("amplitude", "rows", "columns", "latitude_deg", "longitude_deg", "height_m")
 

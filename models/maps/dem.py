@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from terrafix.models.core.arrays import FloatArray, read_arrays
+from terrafix.models.core.arrays import FloatArray, Single, read_arrays
 
-Single = NDArray[np.float32]
 KEYS = ("height_m", "latitude0_deg", "longitude0_deg", "latitude_step_deg", "longitude_step_deg")
 """Arrays in a file of `write_dem`."""
 JACKSBORO = "jacksboro"

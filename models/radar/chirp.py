@@ -19,16 +19,15 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 from scipy.signal import get_window
 
-from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.arrays import ComplexArray, FloatArray
 
 SPEED_OF_LIGHT = 299792458.0
 """Speed of light in vacuum [m/s]."""
 
-ComplexArray = NDArray[np.complex64]
 Window = str | tuple[Any, ...]
 """A window as `scipy.signal.get_window` names it: ``"boxcar"``, ``("kaiser", 2.5)``."""
 

@@ -23,8 +23,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from terrafix.models.core.arrays import FloatArray
-from terrafix.models.radar.chirp import ComplexArray
+from terrafix.models.core.arrays import ComplexArray, FloatArray
 
 
 def fractional_centroid(echo: ComplexArray, prf: float) -> tuple[float, float]:

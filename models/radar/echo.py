@@ -38,17 +38,11 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy import fft
 
-from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.arrays import ComplexArray, FloatArray
 from terrafix.models.core.parallel import batches, over
 from terrafix.models.geometry.geodesy import ecef
 from terrafix.models.motion.arc import OrbitArc
-from terrafix.models.radar.chirp import (
-    SPEED_OF_LIGHT,
-    ComplexArray,
-    Radar,
-    chirp_replica,
-    unit_phasor,
-)
+from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Radar, chirp_replica, unit_phasor
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.history import RangeHistories, range_derivatives
 from terrafix.models.radar.resampling import stretched

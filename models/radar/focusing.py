@@ -39,11 +39,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.signal import get_window
 
-from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.arrays import ComplexArray, FloatArray
 from terrafix.models.core.parallel import batches, over
 from terrafix.models.radar.chirp import (
     SPEED_OF_LIGHT,
-    ComplexArray,
     Radar,
     Window,
     compression_filter,

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
-from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.arrays import FloatArray, Single
 from terrafix.models.geometry.geodesy import ecef, geodetic, local_axes
 from terrafix.models.geometry.geolocation import ground_point
 from terrafix.models.motion.arc import OrbitArc, seen_at
 from terrafix.models.radar.chirp import Radar
-from terrafix.models.radar.scene import CELL, Scene, Single, brightness
+from terrafix.models.radar.scene import CELL, Scene, brightness
 
 _COARSE = (16, 4)
 """Lines and cells between the points at which terrain is looked up."""

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.models.core.arrays import ComplexArray
 from terrafix.models.radar.autofocus import Focus, SharpnessCurve, autofocus
-from terrafix.models.radar.chirp import ComplexArray, Radar
+from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.doppler import fractional_centroid
 from terrafix.models.radar.focusing import Image, RangeDoppler, azimuth_compressed, range_doppler
 

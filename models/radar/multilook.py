@@ -9,9 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from terrafix.models.core.arrays import FloatArray
-from terrafix.models.radar.chirp import ComplexArray
-from terrafix.models.radar.scene import Single
+from terrafix.models.core.arrays import ComplexArray, FloatArray, Single
 
 
 def detected(image: ComplexArray, looks: tuple[int, int]) -> Single:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.models.core.arrays import read_arrays
-from terrafix.models.radar.chirp import ComplexArray, gain_compensated
+from terrafix.models.core.arrays import ComplexArray, read_arrays
+from terrafix.models.radar.chirp import gain_compensated
 
 PLACE = ("first_rg_line", "first_rg_cell")
 

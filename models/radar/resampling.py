@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.models.core.arrays import FloatArray
-from terrafix.models.radar.chirp import ComplexArray
+from terrafix.models.core.arrays import ComplexArray, FloatArray
 
 _TAPS = 8
 _BLOCK_SHIFT = 0.01

@@ -21,9 +21,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.arrays import FloatArray, Single
 from terrafix.models.core.parallel import batches, over
 from terrafix.models.maps.dem import Dem
 
@@ -36,8 +35,6 @@ _COARSE = 32
 """Cells between the samples of the parcels' and the smooth variation's noise."""
 _PARCEL, _SMOOTH, _FINE = 1.0, 3.0, 1.0
 """Standard deviations of the smoothing: of the first two in coarse cells, of the last in cells."""
-
-Single = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

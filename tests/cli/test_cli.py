@@ -1,4 +1,8 @@
-"""The command line as a person or a script meets it: real processes, exit status, streams."""
+"""The command line as a person or a script meets it: exit status and streams.
+
+Most of it is called in this process; what a process is for (imports, signals, streams that are
+really two) is tried with real ones.
+"""
 
 import json
 import os
@@ -10,20 +14,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner, Result
 
+from terrafix.cli import main
 from terrafix.cosim.records.results import read_result
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 OPEN_LOOP, ORBIT = EXAMPLES / "spacecraft_sar_open_loop.toml", EXAMPLES / "orbit.toml"
 
 
-def terrafix(*words: object, **options) -> subprocess.CompletedProcess:
+def process(*words: object, **options) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "terrafix", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, check=False, **options)
 
 
+def terrafix(*words: object) -> Result:
+    """The command in this process: `exit_code`, `stdout`, `stderr`."""
+    return CliRunner().invoke(main, list(map(str, words)))
+
+
 def test_json_of_a_run_is_one_object_and_all_of_it():
-    done = terrafix("run", OPEN_LOOP, "--members", 3, "--duration", "30", "--json")
+    done = process("run", OPEN_LOOP, "--members", 3, "--duration", "30", "--json")
     assert done.returncode == 0
     result = json.loads(done.stdout)
     assert done.stdout.count("\n") == 1
@@ -69,7 +80,7 @@ def test_files_are_written_and_named(tmp_path):
         *("--set", "orbit.gravity=two-body", "--set", "orbit.r0_i=[7000, 0, 0] km"),
         *("--set", "orbit.v0_i=0,7500,0", "--set", "record.orbit.period=60"),
     )
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert "600 ticks" in done.stdout
     assert f"wrote {out}" in done.stderr
     assert plot.read_bytes().startswith(b"\x89PNG")
@@ -104,7 +115,7 @@ def test_a_choice_is_made_with_set():
 
 def test_check_says_what_is_there():
     done = terrafix("check", OPEN_LOOP, "--json")
-    assert done.returncode == 0
+    assert done.exit_code == 0
     content = json.loads(done.stdout)
     assert content["ok"] is True
     assert content["problems"] == []
@@ -119,7 +130,7 @@ def test_graph_writes_text_and_pictures(tmp_path):
     assert text.startswith("flowchart LR")
     assert "posterior, read at the start of the step" in text
     for name, start in (("a.svg", b"<?xml"), ("a.png", b"\x89PNG"), ("a.mmd", b"flowchart")):
-        assert terrafix("graph", OPEN_LOOP, "-o", tmp_path / name).returncode == 0
+        assert terrafix("graph", OPEN_LOOP, "-o", tmp_path / name).exit_code == 0
         assert (tmp_path / name).read_bytes().startswith(start)
 
 
@@ -144,15 +155,24 @@ def test_components_are_listed_and_described():
         (("fly", ORBIT), "No such command"),
     ],
 )
-def test_bad_input_is_status_2_and_no_traceback(words, text, tmp_path):
-    done = terrafix(*words, cwd=tmp_path)
-    assert done.returncode == 2
+def test_bad_input_is_status_2_and_no_traceback(words, text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = terrafix(*words)
+    assert done.exit_code == 2
     assert text in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
-    as_json = terrafix(*words, "--json", cwd=tmp_path)
-    assert as_json.returncode == 2
+    as_json = terrafix(*words, "--json")
+    assert as_json.exit_code == 2
     assert json.loads(as_json.stdout)["error"]["status"] == 2
+
+
+def test_bad_input_is_the_same_for_a_process(tmp_path):
+    done = process("run", "absent.toml", "--json", cwd=tmp_path)
+    assert done.returncode == 2
+    assert json.loads(done.stdout)["error"]["status"] == 2
+    assert "there is no system file 'absent.toml'" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_a_run_that_fails_is_status_1_and_keeps_its_records(tmp_path):
@@ -162,7 +182,7 @@ def test_a_run_that_fails_is_status_1_and_keeps_its_records(tmp_path):
         *("run", ORBIT, "--duration", "100", "--out", out, "--json"),
         *("--set", "orbit.mu=1e308", "--set", "orbit.r0_i=1,0,0"),
     )
-    assert done.returncode == 1
+    assert done.exit_code == 1
     result = json.loads(done.stdout)
     assert result["status"].startswith("failed: no member is left")
     assert result["excluded"][0]["component"] == "orbit"
@@ -173,7 +193,7 @@ def test_a_run_that_fails_is_status_1_and_keeps_its_records(tmp_path):
 def test_ctrl_c_keeps_what_was_recorded(tmp_path):
     out = tmp_path / "run.nc"
     command = [sys.executable, "-m", "terrafix", "run", str(ORBIT), "--out", str(out)]
-    process = subprocess.Popen(
+    flying = subprocess.Popen(
         [*command, "--duration", "100000000"],
         stderr=subprocess.PIPE,
         text=True,
@@ -181,13 +201,12 @@ def test_ctrl_c_keeps_what_was_recorded(tmp_path):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     deadline = time.monotonic() + 60
-    while not (tmp_path / "run.nc.parts" / "manifest.json").exists():
+    while len(list((tmp_path / "run.nc.parts").glob("*.npz"))) < 2:
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    time.sleep(0.5)
-    os.kill(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 1
+    os.kill(flying.pid, signal.SIGINT)
+    _, errors = flying.communicate(timeout=60)
+    assert flying.returncode == 1
     assert f"what was recorded until then is in {out}" in errors
     assert "Traceback" not in errors
     assert len(read_result(out)["time"]) > 1

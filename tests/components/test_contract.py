@@ -235,7 +235,7 @@ def test_parameters_cannot_be_set_while_a_simulation_runs(build):
 
 def test_every_type_that_comes_with_terrafix_is_registered_and_tested():
     folder = Path(__file__).parents[2] / "components"
-    public = {n for file in folder.glob("*.py") for n in _components(file)}
+    public = {n for file in folder.rglob("*.py") for n in _components(file)}
     assert {component_entries()[n].value.split(":")[1] for n in TYPES if n not in FOREIGN} == public
 
 
@@ -243,5 +243,6 @@ def _components(file: Path) -> list[str]:
     """Names of the component classes that a module defines for use, from its text."""
     tree = ast.parse(file.read_text())
     classes = [n for n in tree.body if isinstance(n, ast.ClassDef) and n.name[0] != "_"]
-    bases = ("Component", "SymbolicComponent", "Evaluation", "_Playback", "_Echo", "_Reference")
-    return [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
+    bases = ("Component", "SymbolicComponent", "Evaluation", "Playback", "_Echo", "_Reference")
+    derived = [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
+    return [name for name in derived if name not in bases]

@@ -16,15 +16,11 @@ DIAGRAMS = (".svg", ".png", ".mmd")
 @json_option
 def check(system: str, settings: Settings, as_json: bool) -> None:
     """Find every mistake in a system, and say what it consists of."""
-    from terrafix.cosim.system.check import check as check_system
-    from terrafix.cosim.system.display import plan_content, plan_tables
-
-    loaded = read(system, settings)
-    plan = check_system(loaded, duration=loaded.duration)
+    plan = read(system, settings).check()
     if as_json:
-        print_json(plan_content(plan))
+        print_json(plan.content())
     else:
-        show(*plan_tables(plan))
+        show(plan)
 
 
 @click.command()
@@ -33,16 +29,12 @@ def check(system: str, settings: Settings, as_json: bool) -> None:
 @click.option("-o", "out", metavar="FILE", help="Write .svg, .png or .mmd (Mermaid) there.")
 def graph(system: str, settings: Settings, out: str | None) -> None:
     """Draw a system; without -o, print it as Mermaid text."""
-    from terrafix.cosim.system.graph import draw, mermaid
-
     target = target_of("-o", out, DIAGRAMS)
-    loaded = read(system, settings)
+    diagram = read(system, settings).graph()
     if target is None:
-        print(mermaid(loaded), end="")
-    elif target.suffix.lower() == ".mmd":
-        target.write_text(mermaid(loaded), encoding="utf-8")
+        print(diagram)
     else:
-        draw(loaded, target)
+        diagram.save(target)
 
 
 @click.command()
@@ -50,7 +42,7 @@ def graph(system: str, settings: Settings, out: str | None) -> None:
 @json_option
 def components(kind: str | None, as_json: bool) -> None:
     """List component types, or the parameters and ports of one type."""
-    from terrafix.cosim.system import display as listing
+    from terrafix.cosim.declare import listing
 
     content = listing.types_content() if kind is None else listing.type_content(kind)
     if as_json:

@@ -23,7 +23,7 @@ from terrafix.cli.output import FAILED, print_json, show
 from terrafix.cosim.basics.errors import ConfigurationError, StepError, TerrafixError
 
 if TYPE_CHECKING:
-    from terrafix.cosim.engine.simulation import Result
+    from terrafix.cosim.engine.result import Result
     from terrafix.cosim.system.system import System
 
 FIGURES = (".png", ".svg", ".pdf")

@@ -29,6 +29,20 @@ from terrafix.cosim.system.wiring import check_connection, port_factor
         ("px", "m", None),
         ("m/s", "m/s^2", None),
         ("1", "m", None),
+        ("rpm", "rad/s", 2 * math.pi / 60),
+        ("Hz", "1/s", 1.0),
+        ("deg/sqrt(h)", "rad/s^0.5", math.pi / 180 / 60),
+        ("deg/h^0.5", "rad/s^0.5", math.pi / 180 / 60),
+        ("rad", "1", 1.0),
+        ("N*m/rad", "N*m", 1.0),
+        ("m*rad/s", "m/s", 1.0),
+        # a rotation is no frequency, and neither degrees nor turns are plain numbers
+        ("rpm", "Hz", None),
+        ("Hz", "rad/s", None),
+        ("rad/s", "1/s", None),
+        ("rad^2/s", "1/s", None),
+        ("deg", "1", None),
+        ("turn", "1", None),
     ],
 )
 def test_conversion_factors(source, target, factor):
@@ -41,6 +55,22 @@ def test_what_is_no_unit_or_no_pure_factor_is_refused():
         conversion_factor("metre per", "m")
     with pytest.raises(ConfigurationError, match="is not a pure factor"):
         conversion_factor("degC", "kelvin")
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "advice"),
+    [
+        ("rpm", "Hz", r"a turn is 2 pi rad; write both sides as rad/s, or both as Hz"),
+        ("deg", "1", "an angle becomes a plain number in radians alone: write it in rad"),
+        ("ug", "m/s^2", "g is gram; for standard gravity write ug_0"),
+        ("mg/Hz^0.5", "m/s^2/Hz^0.5", r"g is gram; for standard gravity write mg_0/Hz\^0.5"),
+        ("m", "s", "the units differ: m is not s$"),
+    ],
+)
+def test_a_common_mistake_is_answered(source, target, advice):
+    a, b = Output(unit=source), Input(unit=target)
+    with pytest.raises(WiringError, match=advice):
+        check_connection("a.y", a, "b.u", b)
 
 
 def factor(a, b):

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 
@@ -124,6 +129,27 @@ class Tripwire(Component):
         if t == 7 and (self.environment.members == self.victim).any():
             raise ValueError("the wire was touched")
         self.y = self.u
+
+
+class Hold(Component):
+    """Waits at t = 7 while the folder ``HOLD`` is there, with members from ``HOLD_FROM`` on.
+
+    A file in that folder says which members wait, by the first one, and in which process.
+    """
+
+    default_rate = Rate("1")
+
+    def _step_impl(self, t, dt):
+        folder = os.environ.get("HOLD")
+        first = int(self.environment.members[0])
+        if folder is None or t != 7 or first < int(os.environ["HOLD_FROM"]):
+            return
+        file = Path(folder, f"{first}")
+        with suppress(FileNotFoundError):
+            file.with_suffix(".new").write_text(f"{os.getpid()}")
+            file.with_suffix(".new").replace(file)
+        while Path(folder).exists():
+            time.sleep(0.01)
 
 
 def scalar_system(duration=20, tripwire=None, **settings):

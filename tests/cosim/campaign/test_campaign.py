@@ -7,15 +7,20 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from campaign_parts import scalar_system
+from campaign_parts import Judge, scalar_system
+from click.testing import CliRunner
 
+from terrafix.cli import main
 from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError, SystemCheckError
 from terrafix.cosim.campaign import campaign as module
+from terrafix.cosim.campaign.batch import FileSource
 from terrafix.cosim.campaign.campaign import CampaignError, run_campaign
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.kernels import toolchain
@@ -169,7 +174,7 @@ def test_a_component_that_raises_costs_its_member_alone():
     right = fly(scalar_system(tripwire=-1), runs=130).statistics["judge"]
     mine = result.statistics["judge"]
     assert mine.n.tolist() == [130] * 7 + [129] * 14
-    np.testing.assert_array_equal(mine.mean[:7], right.mean[:7])
+    np.testing.assert_array_equal(mine["mean_error"][:7], right["mean_error"][:7])
 
 
 def test_nobody_left_is_an_error():
@@ -199,6 +204,97 @@ def test_a_system_without_evaluation_is_refused():
     system.add(type(inner.nodes["filter"])(), "filter")
     with pytest.raises(ConfigurationError, match="has no evaluation component"):
         fly(system, runs=2)
+
+
+# ------------------------------------------------------------------------- what is given, and shown
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """A system file whose components this process knows."""
+    monkeypatch.syspath_prepend(str(plugin(tmp_path)))
+    file = tmp_path / "scalar.toml"
+    file.write_text(SYSTEM)
+    return file
+
+
+def test_a_path_is_enough(file, whole, monkeypatch):
+    assert contents(fly(file)) == contents(whole)
+    monkeypatch.chdir(file.parent)
+    assert contents(fly("scalar.toml")) == contents(whole)
+    set_so = fly(file, runs=64, settings=[("filter.wall", "4 m")])
+    assert contents(set_so) == contents(fly(scalar_system(wall=4.0), runs=64))
+    given = FileSource(str(file), (("filter.wall", "3 m"), ("filter.tuning", "2")))
+    last = fly(given, runs=64, settings=[("filter.wall", "4 m")])
+    assert last.source["settings"] == [
+        [*pair] for pair in (*given.settings, ("filter.wall", "4 m"))
+    ]
+    assert contents(last) == contents(fly(scalar_system(wall=4.0, tuning=2.0), runs=64))
+
+
+def test_what_cannot_be_flown_is_refused(file):
+    with pytest.raises(ConfigurationError, match="'scalar' is built already, so settings cannot"):
+        fly(settings=[("filter.wall", "4 m")])
+    with pytest.raises(ConfigurationError, match="a system or the path of its file, not dict"):
+        fly({"filter": 1})
+    with pytest.raises(ConfigurationError, match=r"absent\.toml"):
+        fly(file.parent / "absent.toml")
+    with pytest.raises(SystemCheckError, match="did you mean 'wall'"):
+        fly(file, settings=[("filter.wal", "4 m")])
+
+
+def two_judges():
+    """The scalar system, judged twice."""
+    system = scalar_system(wall=4.5, bias=1.0)
+    system.add(Judge(), "second")
+    for port in system.nodes["judge"].inputs():
+        system.connect(f"filter.{port}", f"second.{port}")
+    return system
+
+
+SHOWN_AT_A_PROMPT = [
+    (
+        lambda: fly(),
+        ["scalar: 300 runs", "sample sigma", "NEES", "verdict: ", "of 300 members failed"],
+    ),
+    (lambda: fly(two_judges()), ["judge\n", "second\n", "biased: mean error of x"]),
+    (lambda: fly(runs=2), ["verdict: undecided", "fly 3 or more"]),
+]
+
+
+@pytest.mark.parametrize(("made", "parts"), SHOWN_AT_A_PROMPT)
+def test_a_result_shows_itself_on_one_screen(made, parts):
+    result = made()
+    text = repr(result)
+    for part in parts:
+        assert part in text
+    assert len(text.splitlines()) <= 40
+    assert max(map(len, text.splitlines())) <= 100
+    html = re.sub("<[^>]*>", "", result._repr_html_())
+    assert unescape(html).strip() == text
+    statistics, verdict = result.statistics["judge"], result.verdicts["judge"]
+    assert repr(statistics).startswith("<Statistics of 'judge': ")
+    assert len(repr(statistics)) < 120
+    assert verdict.text in repr(verdict)
+    assert len(repr(verdict).splitlines()) <= 6
+
+
+def test_the_repr_of_a_campaign_of_many_things_is_still_a_screen(whole):
+    many = replace(
+        whole,
+        statistics={f"judge{k}": whole.statistics["judge"] for k in range(40)},
+        verdicts={f"judge{k}": whole.verdicts["judge"] for k in range(40)},
+        reasons={f"reason {k}": 1 for k in range(300)},
+    )
+    text = repr(many)
+    assert "and judge3 (" in text
+    assert "and 295 other reasons" in text
+    assert len(text.splitlines()) <= 60
+
+
+def test_a_column_that_is_not_there_is_named(whole):
+    with pytest.raises(ConfigurationError, match="no 'mean_eror'\n  did you mean 'mean_error'"):
+        whole.statistics["judge"]["mean_eror"]
 
 
 # ------------------------------------------------------------------------- dispersions
@@ -309,6 +405,8 @@ type = "scalar_filter"
 wall = "4.5 m"
 [component.judge]
 type = "scalar_judge"
+[component.hold]
+type = "scalar_hold"
 [wiring]
 connect = [
     "filter.truth -> judge.truth",
@@ -328,101 +426,109 @@ def plugin(folder):
     (about / "entry_points.txt").write_text(
         "[terrafix.components]\nscalar_filter = campaign_parts:Filter\n"
         "scalar_judge = campaign_parts:Judge\n"
+        "scalar_hold = campaign_parts:Hold\n"
     )
     return folder
 
 
 @pytest.fixture
-def line(tmp_path):
-    """Run terrafix in a folder that holds the system."""
+def folder(tmp_path, monkeypatch):
+    """The folder we are in, which holds the system; the parts are known to whoever starts here."""
     (tmp_path / "scalar.toml").write_text(SYSTEM)
-    search = os.pathsep.join([str(Path(__file__).parent), str(plugin(tmp_path))])
-    environment = {**os.environ, "PYTHONPATH": search, "COLUMNS": "120"}
-
-    def run(*arguments, wait=True):
-        command = [sys.executable, "-m", "terrafix", *arguments]
-        process = subprocess.Popen(
-            command,
-            cwd=tmp_path,
-            env=environment,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        if not wait:
-            return process
-        out, err = process.communicate(timeout=120)
-        return process.returncode, out, err
-
-    return run
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(plugin(tmp_path)))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), str(tmp_path)]))
+    monkeypatch.setenv("COLUMNS", "120")
+    return tmp_path
 
 
-def test_the_command_flies_judges_and_repeats(line, tmp_path, whole):
-    status, out, _ = line(
-        "campaign", "scalar.toml", "--runs", "300", "--out", "c", "--workers", "1"
+def command(*words):
+    """The command in this process: exit status and both streams."""
+    result = CliRunner().invoke(main, words)
+    return result.exit_code, result.stdout, result.stderr
+
+
+def started(*words, **environment):
+    """The command in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "terrafix", *words],
+        env=os.environ | environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        # whoever started the tests in the background has it ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
-    assert status == 0
+
+
+def wait_until(condition, process):
+    """Wait for what a process is about to do."""
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_the_command_flies_judges_and_repeats(folder, whole):
+    flying = started("campaign", "scalar.toml", "--runs", "300", "--out", "c", "--workers", "1")
+    out, _ = flying.communicate(timeout=60)
+    assert flying.returncode == 0
     assert "verdict: " in out
     assert f"{whole.n_excluded} of 300 members failed" in out
-    stored = xr.load_dataset(tmp_path / "c" / "result.nc")
+    stored = xr.load_dataset(folder / "c" / "result.nc")
     assert stored["mean_error"].values.tobytes() == whole.dataset()["mean_error"].values.tobytes()
-    status, out, _ = line("campaign", "scalar.toml", "--runs", "300", "--member", "41", "--json")
+    status, out, _ = command("campaign", "scalar.toml", "--runs", "300", "--member", "41", "--json")
     assert status == 0
     assert json.loads(out)["members"] == 1
-    status, out, err = line("campaign", "scalar.toml", "--out", "c", "--resume", "--json")
+    status, out, err = command("campaign", "scalar.toml", "--out", "c", "--resume", "--json")
     assert (status, err) == (0, "")
     assert json.loads(out)["runs"] == 300
 
 
-def test_a_campaign_killed_three_times_is_completed_to_the_same_bytes(line, tmp_path, whole):
-    command = [
-        "campaign",
-        "scalar.toml",
-        "--runs",
-        "300",
-        "--workers",
-        "2",
-        "--out",
-        "c",
-        "--quiet",
-    ]
-    command += ["--set", "duration=4000"]  # long enough to be killed on the way
-    reference = fly(scalar_system(wall=4.5, duration=4000), seed=5)
-    rng = np.random.default_rng()
-    for _ in range(3):
-        more = ["--resume"] if (tmp_path / "c" / "campaign.json").exists() else []
-        process = line(*command, *more, wait=False)
-        time.sleep(rng.uniform(1.0, 3.5))
-        process.send_signal(signal.SIGKILL)
-        process.communicate(timeout=30)  # its workers end with it, and close the pipes
-    more = ["--resume"] if (tmp_path / "c" / "campaign.json").exists() else []
-    status, _, err = line(*command, *more)
+def test_a_campaign_killed_three_times_is_completed_to_the_same_bytes(folder):
+    """Each time a batch of eight blocks more is done, and the next one under way."""
+    words = ("campaign", "scalar.toml", "--runs", "1600", "--out", "c", "--quiet")
+    reference = fly(runs=1600)
+    hold, blocks, more = folder / "hold", folder / "c" / "blocks", ()
+    hold.mkdir()
+    for workers, done in ("2", 8), ("1", 16), ("1", 24):
+        held = done * 64
+        flying = started(
+            *(*words, "--workers", workers, *more), HOLD=str(hold), HOLD_FROM=str(held)
+        )
+        wait_until((hold / str(held)).exists, flying)
+        wait_until((blocks / f"{done - 1:06d}.npz").exists, flying)
+        flying.kill()
+        flying.communicate(timeout=30)  # its workers end with it, and close the pipes
+        assert flying.returncode == -signal.SIGKILL
+        assert len(list(blocks.glob("*.npz"))) == done
+        more = ("--resume",)
+    written = {block: block.stat().st_mtime_ns for block in blocks.glob("*.npz")}
+    status, _, err = command(*words, "--workers", "1", "--resume")
     assert status == 0, err
-    stored = xr.load_dataset(tmp_path / "c" / "result.nc")
+    assert {block: block.stat().st_mtime_ns for block in written} == written
+    stored = xr.load_dataset(folder / "c" / "result.nc")
     expected = reference.dataset()
     for name in ("mean_error", "covariance_sample", "nees", "nis", "error"):
         assert stored[name].values.tobytes() == expected[name].values.tobytes(), name
 
 
-def test_control_c_says_what_is_kept_and_how_to_go_on(line, tmp_path):
-    command = ["campaign", "scalar.toml", "--runs", "3000", "--workers", "1", "--out", "c"]
-    process = line(*command, "--set", "duration=60000", wait=False)
-    deadline = time.monotonic() + 60
-    while not (tmp_path / "c" / "campaign.json").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    time.sleep(0.5)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 1
+def test_control_c_says_what_is_kept_and_how_to_go_on(folder):
+    (folder / "hold").mkdir()
+    words = ("campaign", "scalar.toml", "--runs", "3000", "--workers", "1", "--out", "c")
+    flying = started(*words, HOLD=str(folder / "hold"), HOLD_FROM="512")
+    wait_until((folder / "hold" / "512").exists, flying)
+    flying.send_signal(signal.SIGINT)
+    _, err = flying.communicate(timeout=60)
+    assert flying.returncode == 1
     assert "Traceback" not in err
-    assert re.search(r"interrupted\n  \d+ of 47 blocks of 64 members are done, and kept", err), err
+    assert re.search(r"interrupted\n  8 of 47 blocks of 64 members are done, and kept", err), err
     assert "complete them with --out c --resume" in err
 
 
-def test_a_script_needs_no_guard(tmp_path, whole):
+def test_a_script_needs_no_guard(folder, whole):
     """Workers do not run the script again; nor one that comes from standard input."""
-    search = os.pathsep.join([str(Path(__file__).parent), str(plugin(tmp_path))])
-    (tmp_path / "scalar.toml").write_text(SYSTEM)
     script = (
         "from terrafix.cosim.campaign.batch import FileSource\n"
         "from terrafix.cosim.campaign.campaign import run_campaign\n"
@@ -432,8 +538,6 @@ def test_a_script_needs_no_guard(tmp_path, whole):
     done = subprocess.run(
         [sys.executable, "-"],
         input=script,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": search},
         text=True,
         capture_output=True,
         timeout=60,
@@ -457,9 +561,11 @@ BAD = [
 ]
 
 
+@pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize(("arguments", "text"), BAD)
-def test_bad_input_is_one_message_and_status_2(line, arguments, text):
-    status, out, err = line(*arguments)
+def test_bad_input_is_one_message_and_status_2(arguments, text, monkeypatch):
+    monkeypatch.setattr(module.pools, "CONNECT_SECONDS", 0.1)
+    status, out, err = command(*arguments)
     assert (status, out) == (2, ""), err
     assert text in err
     assert "Traceback" not in err

@@ -25,7 +25,7 @@ def source(tmp_path, monkeypatch):
     file.write_text(SYSTEM)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HERE), str(plugin(tmp_path))]))
     monkeypatch.syspath_prepend(str(tmp_path))
-    return FileSource(str(file), (("duration", "20000"),))
+    return FileSource(str(file))
 
 
 def bytes_of(result):
@@ -33,26 +33,32 @@ def bytes_of(result):
     return {k: dataset[k].values.tobytes() for k in ("mean_error", "covariance_sample", "error")}
 
 
-def kill_one(client):
-    """Kill a worker once the campaign is under way."""
-
-    def later():
-        time.sleep(1.0)
-        pids = [w["id"] for w in client.scheduler_info()["workers"].values()]
-        processes = client.run(os.getpid)
-        assert pids
-        os.kill(next(iter(processes.values())), signal.SIGKILL)
-        killed.append(True)
-
-    killed: list[bool] = []
-    threading.Thread(target=later, daemon=True).start()
-    kill_one.killed = killed
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-def test_dask_gives_the_same_bytes_though_a_worker_is_killed(source):
+def test_dask_gives_the_same_bytes_though_a_worker_is_killed(source, tmp_path, monkeypatch):
+    """Each worker is held in its first batch; one is killed there, and the others go on."""
     here = run_campaign(source, runs=320, workers=1)
-    there = run_campaign(source, runs=320, dask="local:2", batch=64, started=kill_one)
-    assert kill_one.killed == [True]
+    hold = tmp_path / "hold"
+    hold.mkdir()
+    monkeypatch.setenv("HOLD", str(hold))
+    monkeypatch.setenv("HOLD_FROM", "0")
+    killed = []
+
+    def kill_one():
+        deadline = time.monotonic() + 60
+        while not (held := [f for f in hold.iterdir() if not f.suffix]):
+            if time.monotonic() > deadline:
+                break
+            time.sleep(0.01)
+        for file in held[:1]:
+            os.kill(int(file.read_text()), signal.SIGKILL)
+            killed.append(file.name)
+        hold.rename(tmp_path / "let_go")
+
+    thread = threading.Thread(target=kill_one)
+    there = run_campaign(
+        source, runs=320, dask="local:2", batch=64, started=lambda client: thread.start()
+    )
+    thread.join()
+    assert len(killed) == 1
     assert there.workers == "Dask at local:2"
     assert bytes_of(there) == bytes_of(here)

@@ -7,8 +7,9 @@ from scipy.stats import chi2
 
 from terrafix.cosim.campaign.batch import Task, fly_batch
 from terrafix.cosim.campaign.campaign import run_campaign
-from terrafix.cosim.campaign.results import ratio_interval
-from terrafix.cosim.campaign.statistics import BLOCK, Layout, Statistics, block_of
+from terrafix.cosim.campaign.statistics.ensemble import Statistics, block_of
+from terrafix.cosim.campaign.statistics.moments import ratio_interval
+from terrafix.cosim.campaign.statistics.statistic import BLOCK, Layout
 from terrafix.cosim.campaign.verdict import judge
 
 
@@ -50,27 +51,25 @@ def test_blocks_add_up_to_the_whole(n_members):
     statistics = streamed(history, n_members)
     error = history["q_error"]
     with np.errstate(invalid="ignore"):
-        np.testing.assert_allclose(statistics.mean, np.nanmean(error, axis=1), atol=1e-13)
+        np.testing.assert_allclose(statistics["mean_error"], np.nanmean(error, axis=1), atol=1e-13)
     for epoch in range(5):
         valid = error[epoch][np.isfinite(error[epoch]).all(axis=1)]
         assert statistics.n[epoch] == len(valid)
         if len(valid) > 1:
             np.testing.assert_allclose(
-                statistics.covariance_sample[epoch], np.cov(valid.T), rtol=1e-12
+                statistics["covariance_sample"][epoch], np.cov(valid.T), rtol=1e-12
             )
     np.testing.assert_allclose(
-        statistics.covariance_predicted[0], history["covariance"][0, 0], rtol=1e-12
+        statistics["covariance_predicted"][0], history["covariance"][0, 0], rtol=1e-12
     )
-    np.testing.assert_allclose(statistics.mean_of("nees"), np.nanmean(history["nees"], axis=1))
-    assert np.isnan(statistics.mean_of("nis")[0])
-    np.testing.assert_allclose(
-        statistics.mean_of("nis")[1:], np.nanmean(history["nis"][1:], axis=1)
-    )
+    np.testing.assert_allclose(statistics["nees"], np.nanmean(history["nees"], axis=1))
+    assert np.isnan(statistics["nis"][0])
+    np.testing.assert_allclose(statistics["nis"][1:], np.nanmean(history["nis"][1:], axis=1))
 
 
 def test_quantiles_are_within_a_bin():
     history = random_history(np.random.default_rng(1), 2000)
-    quantiles = streamed(history, 2000).quantiles()
+    quantiles = streamed(history, 2000)["normalized_error_quantiles"]
     z = (history["q_error"] / history["q_sigma"])[0]
     np.testing.assert_allclose(
         quantiles[:, 0], np.quantile(z, [0.025, 0.16, 0.5, 0.84, 0.975], axis=0), atol=0.06
@@ -80,12 +79,12 @@ def test_quantiles_are_within_a_bin():
 def test_successive_innovations_are_correlated_where_they_are():
     rng = np.random.default_rng(2)
     history = random_history(rng, 200)
-    white, pairs = streamed(history, 200).whiteness
+    statistics = streamed(history, 200)
+    white, pairs = statistics["innovation_correlation"], statistics["innovation_pairs"]
     assert (np.abs(white) < 4 / np.sqrt(pairs)).all()
     z = history["normalized_innovation"]
     z[2:] = 0.6 * z[1:-1] + 0.8 * z[2:]
-    colored, _ = streamed(history, 200).whiteness
-    assert (colored > 0.3).all()
+    assert (streamed(history, 200)["innovation_correlation"] > 0.3).all()
 
 
 def test_intervals_of_sigma_ratios_hold_the_truth_as_often_as_they_say():

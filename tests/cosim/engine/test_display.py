@@ -6,7 +6,7 @@ import numpy as np
 from rich.console import Console
 
 from terrafix.cosim.engine.display import result_tables
-from terrafix.cosim.engine.simulation import Result
+from terrafix.cosim.engine.result import Result
 
 
 def text(evaluation, **changes):

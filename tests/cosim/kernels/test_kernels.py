@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import terrafix as tf
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.basics.noise import NormalStream, normal_quantile, stream_key
 from terrafix.cosim.kernels import toolchain
@@ -709,3 +710,24 @@ def test_every_operation_of_vectors_is_that_of_the_virtual_machine(monkeypatch):
             found.append(z)
         np.testing.assert_allclose(*found, rtol=1e-15, atol=0)
         assert np.isfinite(found[0]).all()
+
+
+def test_a_kept_kernel_is_that_of_its_model():
+    """Changing a choice back and forth: a cache by address flew another choice's kernel."""
+
+    class Sign(tf.SymbolicComponent):
+        default_rate = tf.Rate("1")
+        way = tf.Choice(("plus", "minus", "twice"), "plus")
+        y = tf.Output()
+
+        def build_model(self):
+            factor = {"plus": 1.0, "minus": -1.0, "twice": 2.0}[self.way]
+            x = ca.SX.sym("x")
+            return tf.Model("sign", states={"x": x}, next={"x": x + factor}, outputs={"y": x})
+
+    system = tf.System("signs", duration="1")
+    part = system.add(Sign(), "part")
+    system.record("y", [part["y"]])
+    for k in range(40):
+        part.way, expected = [("plus", 1.0), ("minus", -1.0), ("twice", 2.0)][k % 3]
+        assert tf.simulate(system).dataset["part.y"][-1].item() == expected

@@ -4,13 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaign_parts import scalar_system
+from campaign_parts import Filter, Judge, scalar_system
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.campaign.campaign import run_campaign
+from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.files.readers import read_system
-from terrafix.cosim.lincov.deviations import LinearCovariance, linear_covariance
+from terrafix.cosim.lincov import deviations
+from terrafix.cosim.lincov.deviations import linear_covariance
+from terrafix.cosim.lincov.prediction import LinearCovariance
 from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.system import System
 
 OPEN_LOOP = Path(__file__).parents[3] / "examples" / "spacecraft_sar_open_loop.toml"
 
@@ -49,7 +53,7 @@ def test_dispersions_are_sources():
     found = linear_covariance(system)
     sampled = run_campaign(system, runs=4000, workers=1).statistics["judge"]
     assert found.sigma[-1, 0] == pytest.approx(
-        np.sqrt(sampled.covariance_sample[-1, 0, 0]), rel=4 / np.sqrt(8000)
+        np.sqrt(sampled["covariance_sample"][-1, 0, 0]), rel=4 / np.sqrt(8000)
     )
     assert found.budget()["dispersion bias"][0] == pytest.approx(0.3, rel=1e-3)
 
@@ -60,6 +64,30 @@ def test_a_prediction_survives_being_stored():
     assert again.total.tobytes() == found.total.tobytes()
     assert again.labels == found.labels
     assert list(again.sources) == list(found.sources)
+
+
+def test_a_factor_s_dispersion_is_linear_in_its_logarithm():
+    """Bias 0.2 m times a factor within 1.5: sigma 0.2 ln(1.5) / sqrt(3) in the end."""
+    system = scalar_system(bias=0.2)
+    system.disperse(Dispersion("bias", ("filter.bias",), 1.5, kind="log_uniform"))
+    found = linear_covariance(system)
+    expected = 0.2 * np.log(1.5) / np.sqrt(3)
+    assert found.budget()["dispersion bias"][0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_dispersion_of_what_has_no_jacobian_is_named():
+    class ScaledJudge(Judge):
+        """A judge with a parameter of its own."""
+
+        scale = Parameter(1.0)
+
+    system = System("scaled", duration=5)
+    part, judge = system.add(Filter(), "filter"), system.add(ScaledJudge(), "judge")
+    for port in judge.inputs():
+        system.connect(part[port], judge[port])
+    system.disperse(Dispersion("scale", ("judge.scale",), 0.3))
+    with pytest.raises(ConfigurationError, match=r"'scale' feeds 'judge\.scale', which is no"):
+        linear_covariance(system)
 
 
 def test_what_cannot_be_linearized_is_named():
@@ -73,8 +101,18 @@ def open_loop():
 
 
 def test_the_open_loop_is_predicted(open_loop):
-    """A matched filter: what it predicts is what its errors are, but for eight ticks' turn."""
+    """A matched filter: what it predicts is what its errors are, but for a few ticks' turn."""
     np.testing.assert_allclose(open_loop.sigma, open_loop.sigma_filter, rtol=2e-3)
+
+
+def test_a_jacobian_serves_its_neighbors(monkeypatch):
+    """As with one per tick, to the square of what the orbit turns in 17 ticks, 2e-4 rad."""
+    system = read_system(OPEN_LOOP, [("case", "TC-2")])
+    shared = linear_covariance(system, duration="24.6")
+    monkeypatch.setattr(deviations, "EVERY", 1)
+    each = linear_covariance(system, duration="24.6")
+    np.testing.assert_allclose(shared.sigma, each.sigma, rtol=4e-8)
+    assert shared.sigma.tobytes() != each.sigma.tobytes()
 
 
 def test_the_misalignment_about_the_boresight_is_not_observed(open_loop):
@@ -90,7 +128,7 @@ def test_the_open_loop_as_sampled(open_loop):
 
     source = FileSource(str(OPEN_LOOP), (("case", "TC-2"),))
     s = run_campaign(source, runs=256, duration="123", workers=1).statistics["evaluation"]
-    sample = np.sqrt(np.diagonal(s.covariance_sample[-1]))
-    predicted = np.sqrt(np.diagonal(s.covariance_predicted[-1]))
+    sample = np.sqrt(np.diagonal(s["covariance_sample"][-1]))
+    predicted = np.sqrt(np.diagonal(s["covariance_predicted"][-1]))
     np.testing.assert_allclose(sample, open_loop.sigma[-1], rtol=4 / np.sqrt(512))
     np.testing.assert_allclose(predicted, open_loop.sigma_filter[-1], rtol=5e-3)

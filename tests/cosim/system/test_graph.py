@@ -3,7 +3,7 @@
 import re
 from itertools import pairwise
 
-from terrafix.cosim.system.graph import _place, arrows, draw, mermaid
+from terrafix.cosim.system.graph import Diagram, _place, arrows
 from terrafix.cosim.system.order import stepping_order
 
 
@@ -21,7 +21,7 @@ def loop(toys):
 
 
 def test_mermaid_names_components_links_and_when_they_are_read(toys):
-    text = mermaid(loop(toys))
+    text = Diagram(loop(toys)).mermaid
     assert re.findall(r"<b>(\w+)</b>", text) == stepping_order(loop(toys).flatten())
     assert '"t → u"' in text
     assert '"echo → u, read at the start of the step"' in text
@@ -29,7 +29,8 @@ def test_mermaid_names_components_links_and_when_they_are_read(toys):
 
 
 def test_messages_are_dashed(toys):
-    text = mermaid(toys.wire({"a": toys.Sender(), "b": toys.Reader()}, ["a.note -> b.note"]))
+    system = toys.wire({"a": toys.Sender(), "b": toys.Reader()}, ["a.note -> b.note"])
+    text = Diagram(system).mermaid
     assert "-.->" in text
 
 
@@ -48,5 +49,5 @@ def test_sources_stand_left_of_readers_and_nothing_overlaps(toys):
 
 def test_the_same_system_gives_the_same_picture(toys, tmp_path):
     for name in ("one.png", "two.png"):
-        draw(loop(toys), tmp_path / name)
+        loop(toys).graph(tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()

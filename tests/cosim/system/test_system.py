@@ -17,6 +17,7 @@ from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.check import check
 from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.identity import configuration
 from terrafix.cosim.system.system import System
 
 
@@ -322,3 +323,22 @@ def test_a_component_without_a_step_is_refused_before_the_run():
         SystemCheckError, match=r"'idle' cannot step: Idle must provide _step_impl\(t, dt\)"
     ):
         check(system)
+
+
+def test_a_schedule_is_all_of_its_times(toys):
+    """Two schedules that differ from the fifth time on are two: for records and for identity."""
+    times = ["1", "2", "3", "4", "5"], ["1", "2", "3", "4", "6"]
+    flown = []
+    for listed in times:
+        system = System("listed", duration="8")
+        system.add(toys.Clock(rate=Rate(times=listed)), "a")
+        system.add(toys.Clock(rate=Rate(times=times[0])), "b")
+        system.record("both", ["a.t", "b.t"])
+        flown.append(system)
+    identity = configuration(check(flown[0]))
+    assert identity["components"]["a"]["rate"] == "at 1, 2, 3, 4, 5 s"
+    with pytest.raises(SystemCheckError, match="watches components of different rates"):
+        check(flown[1])
+    flown[1].records.clear()
+    other = configuration(check(flown[1]))
+    assert other["components"]["a"] != identity["components"]["a"]

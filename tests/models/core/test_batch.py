@@ -42,3 +42,12 @@ def test_wrong_trailing_axes_are_refused():
         product_array(np.zeros(3), np.zeros(4))
     with pytest.raises(ValueError, match="product takes 2 arrays, got 1"):
         product_array(np.zeros(4))
+
+
+def test_functions_that_come_and_go_keep_to_themselves():
+    """A cache by address gave the result of a function that was gone: 7 of 200 in a loop."""
+    x = np.arange(10.0)
+    for k in range(200):
+        scaled = over_members(lambda a, k=k: k * a, ())
+        scaled(x)
+        assert scaled(x).tolist() == (k * x).tolist()

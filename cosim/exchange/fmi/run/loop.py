@@ -121,7 +121,7 @@ class FmuLoop(Component):
             setup = Setup(file, CO_SIMULATION, f"{env.path}.{name}", inputs, outputs)
             fleet = self._fleets[name] = Fleet(setup, env.n_members)
             for port in part.inputs():
-                fleet.inputs[:, self._at[name, port]] = np.ravel(part.ports[port].default)
+                fleet.inputs[:, self._at[name, port]] = np.asarray(part.ports[port].default).ravel()
         self._t = 0.0
         self._outside(finite=True)
         for name, fleet in self._fleets.items():

@@ -125,9 +125,8 @@ class Dependencies:
         """Reach of the results of a function, from that of its arguments."""
         pattern = _sparsity(call.function)
         function = call.function
-        arguments = np.concatenate(
-            [np.arange(a, a + function.numel_in(i)) for i, a in enumerate(call.arguments)]
-        )
+        ranges = [np.arange(a, a + function.numel_in(i)) for i, a in enumerate(call.arguments)]
+        arguments = np.concatenate([np.arange(0), *ranges])  # of a function without any: none
         results = (pattern @ reach[arguments].astype(np.int64)) > 0
         at = 0
         sent: dict[int, BoolArray] = {}
@@ -154,8 +153,7 @@ def _sparsity(function: Any) -> NDArray[np.int64]:
     import casadi as ca
 
     symbols = [ca.SX.sym(f"x{i}", function.numel_in(i)) for i in range(function.n_in())]
-    results = function(*symbols)
-    results = list(results) if isinstance(results, tuple | list) else [results]
+    results = function.call(symbols)
     n_results, n_arguments = sum(r.numel() for r in results), sum(s.numel() for s in symbols)
     pattern = np.zeros((n_results, n_arguments), dtype=np.int64)
     if n_results and n_arguments:

@@ -143,7 +143,7 @@ class _Writer:
         element = ET.Element("Interface", {"schema": "terrafix-fmu/1"})
         element.set("tick", text_seconds(source.base))
         for part in self.layout.parts:
-            attributes = {"name": part.name, "rate": str(part.rate)}
+            attributes = {"name": part.name, "rate": part.rate.identity()}
             ET.SubElement(element, "Part", attributes)
         for port in self.layout.ports:
             attributes = {"name": port.name, "kind": port.kind}

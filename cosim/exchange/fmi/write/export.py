@@ -216,8 +216,7 @@ def _refuse_unfinished_start(layout: Layout) -> None:
         np.asarray(layout.start_real[a : a + function.numel_in(i)])
         for i, a in enumerate(part.initial.arguments)
     ]
-    results = function(*arguments)
-    results = results if isinstance(results, tuple | list) else (results,)
+    results = function.call(arguments)
     if all(np.isfinite(np.asarray(r)).all() for r in results):
         return
     inputs = [n for n, p in part.component.inputs().items() if p.kind == "signal"]

@@ -14,10 +14,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafix.cosim.basics.clock import Rate, base_step
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import docstring
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.exchange.fmi.write.variables import PortVariables, Variable
@@ -25,7 +25,6 @@ from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.system.flat import Connection
 from terrafix.cosim.system.wiring import port_factor
 
-BoolArray = NDArray[np.bool_]
 TIME = 0
 MOST_TEXT = 400  # of a component's path and a stream's name, in the hash of core.c
 
@@ -181,7 +180,7 @@ class Source:
         assert rate is not None
         tick = base or base_step(rate.exact_numbers, rate.times or ())
         outside = {f"{path}.{name}": name for name in component.ports}
-        doc = (type(component).__doc__ or "").strip().splitlines()[0]
+        doc = docstring(type(component)).partition("\n")[0]
         return cls(
             path.replace(".", "_"),
             doc,
@@ -686,8 +685,7 @@ def _forward(call: Call, name: str, by: Sequence[int], n_outputs: int) -> Call:
 
     function = call.function
     symbols = [ca.SX.sym(f"x{i}", function.numel_in(i)) for i in range(function.n_in())]
-    results = function(*symbols)
-    results = list(results) if isinstance(results, tuple | list) else [results]
+    results = function.call(symbols)
     results = results[:n_outputs]
     seeds = [ca.SX.sym(f"d{i}", function.numel_in(i)) for i in by]
     if seeds and results:

@@ -9,6 +9,7 @@ from inspect import getdoc
 from typing import Any
 
 from terrafix.cosim.basics.clock import text_seconds
+from terrafix.cosim.declare.component import docstring
 from terrafix.cosim.exchange.fmi.write.layout import Layout, Part
 from terrafix.cosim.exchange.fmi.write.variables import Variable
 
@@ -57,7 +58,7 @@ def page(layout: Layout) -> str:
             body += [f"<h2>{title}</h2>", _table(chosen)]
     body.append("<h2>Equations</h2>")
     for part in layout.parts:
-        text = "\n\n".join(filter(None, (getdoc(type(part.component)), _equations(part))))
+        text = "\n\n".join(filter(None, (docstring(type(part.component)), _equations(part))))
         body.append(f"<h3>{escape(part.name)}</h3><pre>{escape(text)}</pre>")
     return (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(source.name)}'

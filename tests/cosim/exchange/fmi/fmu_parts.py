@@ -36,6 +36,24 @@ class EulerIntegrator(SymbolicComponent):
         )
 
 
+class Turning(SymbolicComponent):
+    """x' = cos t: a derivative that depends on time alone."""
+
+    default_rate = Rate("0.1")
+    x = Output((), unit="1", doc="sin t")
+
+    def build_model(self):
+        x, t = ca.SX.sym("x"), ca.SX.sym("t")
+        return Model(
+            "turning",
+            states={"x": x},
+            derivatives={"x": ca.cos(t)},
+            outputs={"x": x},
+            step=ca.SX.sym("dt"),
+            time=t,
+        )
+
+
 class Spring(SymbolicComponent):
     """A mass on a spring, forced: continuous states, an input, feedthrough."""
 

@@ -9,11 +9,13 @@ import sys
 import zipfile
 from pathlib import Path
 
+import casadi as ca
 import fmu_parts
 import numpy as np
 import pytest
 from fmu_helpers import OPEN_LOOP, without_evaluation
 
+import terrafix as tf
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.run import simulate
@@ -509,3 +511,17 @@ def test_an_fmu_loads_without_a_name_clash(exported):
     b = load_library(open_archive(exported("imu", 2)), CO_SIMULATION)
     pointers = [ctypes.cast(x["DoStep"], ctypes.c_void_p).value for x in (a, b)]
     assert pointers[0] != pointers[1]
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_component_without_arguments_or_docstring_is_exported(tmp_path, fmi):
+    class Counter(tf.SymbolicComponent):
+        default_rate = Rate("1")
+        y = tf.Output()
+
+        def build_model(self):
+            x = ca.SX.sym("x")
+            return tf.Model("counter", states={"x": x}, next={"x": x + 1}, outputs={"y": x})
+
+    export_fmu(Counter(), tmp_path / "counter.fmu", fmi=fmi)
+    assert not tf.check_fmu(tmp_path / "counter.fmu").findings

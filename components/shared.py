@@ -1,0 +1,28 @@
+"""What a component needs whose output is one for all members, published by reference."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
+
+
+def common(component: Component, name: str) -> FloatArray:
+    """What is the same for all active members."""
+    values = np.asarray(getattr(component, name))[component.environment.active]
+    if len(values) > 1 and np.any(values != values[:1]):
+        raise ConfigurationError(
+            f"'{component.name}.{name}' differs between members, but its output is one for all\n"
+            "  fly members with one truth: disperse what is known at the start and the sensors, "
+            "not the orbit, the attitude or the antenna; or fly one member at a time"
+        )
+    return np.asarray(values[0])
+
+
+def generator(component: Component) -> np.random.Generator:
+    """Noise of a step, one for all members: of the root seed, the component and its step alone."""
+    env = component.environment
+    words = [env.seed & 0xFFFFFFFF, env.seed >> 32, component.step_index, *env.path.encode()]
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))

@@ -1,0 +1,1 @@
+"""The statistics of a campaign, each one class: from the histories of members to the verdict."""

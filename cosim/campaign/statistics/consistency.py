@@ -1,0 +1,175 @@
+r"""NEES and NIS: means over the members, their chi-square intervals, and the test of NIS.
+
+The sum of NIS is :math:`\chi^2` of all the innovations' elements, times :math:`1.05^2` or
+:math:`0.95^2` at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.ensembles import chi_square_interval
+from terrafix.cosim.campaign.statistics.hypotheses import Evidence, judge_ratios
+from terrafix.cosim.campaign.statistics.statistic import Columns, Layout, Members, Statistic, Sums
+from terrafix.cosim.show.numbers import number
+
+
+class Consistency(Statistic):
+    """Mean of a normalized square at each epoch; a subclass says of which, and what is expected."""
+
+    name: ClassVar[str]
+
+    def degrees(self, layout: Layout, sums: Sums) -> FloatArray:
+        """Expected value at each epoch."""
+        raise NotImplementedError
+
+    def counted(self, sums: Sums) -> NDArray[np.bool_]:
+        """Epochs that count over all."""
+        return np.asarray(sums[f"{self.name}_n"] > 0)
+
+    def independent(self, n: NDArray[np.int64]) -> int:
+        """How many independent values the mean over all epochs has, given how many each has."""
+        raise NotImplementedError
+
+    def sum(self, members: Members) -> Sums:
+        """Sum and count at each epoch; of each member, its mean over time."""
+        values = members.history[self.name]
+        finite = np.isfinite(values)
+        return {
+            f"{self.name}_sum": np.where(finite, values, 0.0).sum(axis=1),
+            f"{self.name}_n": finite.sum(axis=1).astype(np.int64),
+            f"member_{self.name}": _row_mean(values.T),
+        }
+
+    def mean(self, sums: Sums) -> FloatArray:
+        """Mean over the members, (n_epochs,); NaN where there is none."""
+        n = sums[f"{self.name}_n"]
+        return np.where(n > 0, sums[f"{self.name}_sum"] / np.maximum(n, 1), np.nan)
+
+    def columns(self, layout: Layout, sums: Sums) -> Columns:
+        """The mean, and the bounds of its 95 % interval."""
+        bounds = _bounds(self.degrees(layout, sums), sums[f"{self.name}_n"])
+        return {
+            self.name: (("time",), self.mean(sums)),
+            f"{self.name}_low": (("time",), bounds[:, 0]),
+            f"{self.name}_high": (("time",), bounds[:, 1]),
+        }
+
+    def summarize(self, layout: Layout, sums: Sums) -> dict[str, Any]:
+        """Time mean, its interval, and the part of epochs inside theirs."""
+        given = self.counted(sums)
+        if not given.any():
+            return {self.name: {"mean": None, "interval_95": None, "fraction_inside": None}}
+        mean = self.mean(sums)[given]
+        n, dof = sums[f"{self.name}_n"][given], self.degrees(layout, sums)[given]
+        bounds = _bounds(dof, n)
+        inside = (mean >= bounds[:, 0]) & (mean <= bounds[:, 1])
+        return {
+            self.name: {
+                "mean": float(np.average(mean, weights=n)),
+                "dof": float(np.average(dof, weights=n)),
+                "interval_95": list(chi_square_interval(float(np.mean(dof)), self.independent(n))),
+                "fraction_inside": float(inside.mean()),
+            }
+        }
+
+    def facts(self, summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """One sentence."""
+        found = summary.get(self.name)
+        if found and found["mean"] is not None:
+            low, high = found["interval_95"]
+            yield (
+                self.name.upper(),
+                f"{number(found['mean'])} on average, expected {number(found['dof'])}, "
+                f"95 % interval {number(low)} to {number(high)}; "
+                f"{found['fraction_inside']:.0%} of the epochs inside theirs",
+            )
+
+
+class Nees(Consistency):
+    """Normalized estimation error squared; it is correlated from epoch to epoch."""
+
+    name = "nees"
+    merged = ("nees_sum", "nees_n")
+
+    def degrees(self, layout: Layout, sums: Sums) -> FloatArray:
+        """As many as axes."""
+        return np.full(len(sums["nees_n"]), float(len(layout.labels)))
+
+    def counted(self, sums: Sums) -> NDArray[np.bool_]:
+        """Those at fixes, where there are any."""
+        given = super().counted(sums)
+        at_fixes = given & (sums["nis_n"] > 0) if "nis_n" in sums else given
+        return at_fixes if at_fixes.any() else given
+
+    def independent(self, n: NDArray[np.int64]) -> int:
+        """As many as members: an interval is that of a single epoch."""
+        return int(n.max())
+
+    def sum(self, members: Members) -> Sums:
+        """Nothing where it is not published."""
+        return super().sum(members) if self.name in members.history else {}
+
+
+class Nis(Consistency):
+    """Normalized innovation squared, and the test of its sum."""
+
+    name = "nis"
+    merged = ("nis_sum", "nis_n", "dof")
+    families = ("NIS",)
+    spoiled_by_bias = True
+
+    def degrees(self, layout: Layout, sums: Sums) -> FloatArray:
+        """Mean number of elements measured."""
+        del layout
+        n = sums["nis_n"]
+        return np.where(n > 0, sums["dof"] / np.maximum(n, 1), 0.0)
+
+    def independent(self, n: NDArray[np.int64]) -> int:
+        """Every value: innovations are white."""
+        return int(n.sum())
+
+    def sum(self, members: Members) -> Sums:
+        """The degrees of freedom too."""
+        if not members.layout.has_innovation:
+            return {}
+        finite = np.isfinite(members.history["nis"])
+        dof = np.where(finite, members.history["nis_dof"], 0.0).sum(axis=1)
+        return super().sum(members) | {"dof": dof}
+
+    def judge(self, layout: Layout, sums: Sums, share: float) -> Evidence:
+        """Test the sum over everything."""
+        del layout
+        total, dof, n = sums["nis_sum"].sum(), sums["dof"].sum(), int(sums["nis_n"].sum())
+        if not dof:
+            return [], 0
+
+        def describe(worst: Any) -> str:
+            del worst
+            return (
+                f"NIS is {total / n:.4g} on average, expected {dof / n:.4g}, over {n} innovations"
+            )
+
+        return judge_ratios(np.array([total / dof]), np.array([dof]), describe, share)
+
+
+def _bounds(dof: FloatArray, n: NDArray[np.int64]) -> FloatArray:
+    """95 % intervals of the mean of `n` values each, (n_epochs, 2); NaN where there is none."""
+    pairs = [(float(d), int(k)) for d, k in zip(dof, n, strict=True)]
+    found = {
+        (d, k): chi_square_interval(d, k) if k and d else (np.nan, np.nan) for d, k in set(pairs)
+    }
+    return np.array([found[pair] for pair in pairs])
+
+
+def _row_mean(rows: FloatArray) -> FloatArray:
+    rows = np.ascontiguousarray(rows)
+    finite = np.isfinite(rows)
+    n = finite.sum(axis=1)
+    total = np.where(finite, rows, 0.0).sum(axis=1)
+    return np.where(n > 0, total / np.maximum(n, 1), np.nan)

@@ -1,0 +1,233 @@
+"""What deviates in a system: who reads what, where it stands in z, and what drives it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.evaluation import Evaluation
+from terrafix.cosim.kernels.symbolic import SymbolicComponent
+from terrafix.cosim.lincov.jacobians import Key, Linear
+from terrafix.cosim.system.check import Plan
+from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.wiring import port_factor
+
+
+class Wires:
+    """Where the inputs of a system come from.
+
+    Raises
+    ------
+    ConfigurationError
+        If the system has not one evaluation, or a component that cannot be linearized.
+    """
+
+    def __init__(self, plan: Plan, system: str) -> None:
+        self._components = plan.flat.components
+        self._connections = {c.target: c for c in plan.flat.connections}
+        evaluations = {p: c for p, c in self._components.items() if isinstance(c, Evaluation)}
+        if len(evaluations) != 1:
+            raise ConfigurationError(
+                f"linear covariance analysis needs one evaluation component, and system "
+                f"'{system}' has {len(evaluations)}"
+            )
+        ((self.evaluation_path, self.evaluation),) = evaluations.items()
+        try:
+            self.error_model = self.evaluation.error_model()
+        except NotImplementedError:
+            raise ConfigurationError(
+                f"'{self.evaluation_path}' ({type(self.evaluation).__name__}) offers no "
+                "error_model, which linear covariance analysis needs"
+            ) from None
+        self.symbolic: dict[str, SymbolicComponent] = {}
+        for path, component in self._components.items():
+            if isinstance(component, SymbolicComponent):
+                self.symbolic[path] = component
+            elif component is not self.evaluation:
+                raise ConfigurationError(
+                    f"'{path}' ({type(component).__name__}) has no symbolic Jacobian, so the "
+                    "system cannot be linearized\n  fly a campaign instead"
+                )
+
+    def source(self, path: str, name: str) -> tuple[Key, FloatArray | None] | None:
+        """Where an input comes from, and its unit conversion; None if it does not deviate."""
+        head, _, tail = name.partition(".")
+        connection = self._connections.get(f"{path}.{head}")
+        if connection is None:
+            return None
+        owner, _, port_name = connection.source.rpartition(".")
+        port = self._components[path].ports[head]
+        if connection.delay or port.window or port.queue > 1:
+            what = "a delay" if connection.delay else "a window or queue"
+            raise ConfigurationError(
+                f"the connection to '{path}.{head}' has {what}, which is not linearized\n"
+                "  fly a campaign instead"
+            )
+        factor = port_factor(self._components[owner].ports[port_name], port)
+        if factor is not None:
+            factor = _part(port, tail, factor)
+        if port.at == "start":
+            return ("held", path, name), factor
+        return self.slot_of(path, name), factor
+
+    def slot_of(self, path: str, name: str) -> Key:
+        """The slot behind an input, whenever it is read."""
+        head, _, tail = name.partition(".")
+        owner, _, port_name = self._connections[f"{path}.{head}"].source.rpartition(".")
+        return "slot", owner, f"{port_name}.{tail}" if tail else port_name
+
+    def inputs(self, path: str) -> dict[str, tuple[Key, FloatArray | None]]:
+        """Inputs of a symbolic component that deviate: vectors, but for times and freshness."""
+        model = self.symbolic[path].model
+        found = {}
+        for name in model.inputs:
+            if not name.endswith((".fresh", ".t")) and len(model.shape(name)) == 1:
+                source = self.source(path, name)
+                if source is not None:
+                    found[name] = source
+        return found
+
+    def outputs_read(self) -> dict[str, set[str]]:
+        """By component, those of its outputs that anybody reads."""
+        found: dict[str, set[str]] = {}
+        readers = [(p, list(c.model.inputs)) for p, c in self.symbolic.items()]
+        readers.append((self.evaluation_path, list(self.error_model.inputs)))
+        for path, names in readers:
+            for name in names:
+                if f"{path}.{name.partition('.')[0]}" in self._connections:
+                    _, owner, full = self.slot_of(path, name)
+                    found.setdefault(owner, set()).add(full)
+        return found
+
+
+def _part(port: Any, tail: str, factor: FloatArray) -> FloatArray | None:
+    start = 0
+    for name, each in port.fields.items():
+        if name == tail:
+            return factor[start : start + each.size]
+        start += each.size
+    return None
+
+
+class Layout:
+    """Places in z of everything that deviates, and the draws that it starts from.
+
+    Attributes
+    ----------
+    linear : dict of str to Linear
+    place : dict of Key to slice
+    size : int
+        Of z.
+    held : dict of Key to (Key, ndarray or None)
+        What is latched when a step ends, from where, with the conversion of units.
+    sources : list of str
+        Of noise, dispersions last.
+    draws : dict of str to (slice, ndarray)
+        Of sources that draw once, at the start: their columns, and the covariance of the draw.
+    n_draws : int
+    effects : list of (Key, str, ndarray)
+        Dispersed parameters: by which draw, and how.
+    """
+
+    def __init__(self, plan: Plan, wires: Wires) -> None:
+        dispersed: dict[Key, Dispersion] = {}
+        for d in plan.flat.dispersions:
+            for target in d.targets:
+                owner, _, name = target.rpartition(".")
+                dispersed["parameter", owner, name] = d
+        read = wires.outputs_read()
+        self.linear = {
+            path: Linear(
+                path,
+                component,
+                wires.inputs(path),
+                [*read.get(path, ())],
+                [n for n in component.model.parameters if ("parameter", path, n) in dispersed],
+            )
+            for path, component in wires.symbolic.items()
+        }
+        self.place: dict[Key, slice] = {}
+        self.held: dict[Key, tuple[Key, FloatArray | None]] = {}
+        self.sources: list[str] = []
+        self.draws: dict[str, tuple[slice, FloatArray]] = {}
+        self.size = self.n_draws = 0
+        for path, linear in self.linear.items():
+            for name in linear.states:
+                self._room(("state", path, name), linear.sizes[name])
+            for name in linear.outputs:
+                self._room(("slot", path, name), linear.sizes[name])
+            for name, (key, factor) in linear.inputs.items():
+                if key[0] == "held":
+                    self._room(key, linear.sizes[name])
+                    self.held[key] = (wires.slot_of(path, name), factor)
+            for name in linear.noise:
+                self.sources += [f"{path}.{name} at the start", f"{path}.{name}"]
+                self._draw(f"{path}.{name} at the start", np.eye(linear.sizes[name]))
+        self.held = {key: found for key, found in self.held.items() if found[0] in self.place}
+        self._disperse(plan, dispersed)
+
+    def _room(self, key: Key, size: int) -> None:
+        if key not in self.place:
+            self.place[key] = slice(self.size, self.size + size)
+            self.size += size
+
+    def _draw(self, source: str, covariance: FloatArray) -> None:
+        n = len(covariance)
+        self.draws[source] = (slice(self.n_draws, self.n_draws + n), covariance)
+        self.n_draws += n
+
+    def _disperse(self, plan: Plan, dispersed: Mapping[Key, Dispersion]) -> None:
+        """Give dispersed parameters their places; targets of one dispersion take the same draw."""
+        self.effects: list[tuple[Key, str, FloatArray]] = []
+        for key, d in dispersed.items():
+            _, owner, name = key
+            linear = self.linear.get(owner)
+            if linear is None or name not in linear.parameters:
+                raise ConfigurationError(
+                    f"dispersion '{d.name}' feeds '{owner}.{name}', which is no parameter of a "
+                    "symbolic model, so that its effect cannot be linearized\n"
+                    "  fly a campaign instead"
+                )
+            self._room(key, linear.sizes[name])
+            nominal = linear.component.arguments()[name].reshape(-1)
+            source = f"dispersion {d.name}"
+            if source not in self.draws:
+                self.sources.append(source)
+                self._draw(source, _covariance(d, plan.flat.components, len(nominal)))
+            self.effects.append((key, source, _effect(d, nominal)))
+
+    def start(self) -> FloatArray:
+        """Derivative of z by the draws before anything starts, (size, n_draws)."""
+        found = np.zeros((self.size, self.n_draws))
+        for key, source, effect in self.effects:
+            found[self.place[key], self.draws[source][0]] = effect
+        return found
+
+
+def _covariance(d: Dispersion, components: Mapping[str, Any], size: int) -> FloatArray:
+    """Covariance of a dispersion's draw, of as many numbers as the parameter has."""
+    spread = d.read_spread(components)
+    if d.kind == "multivariate":
+        return spread
+    if d.kind == "list":
+        flat = spread.reshape(len(spread), -1)
+        found: FloatArray = np.atleast_2d(np.cov(flat.T, bias=True))
+        return found
+    width = np.broadcast_to(spread.reshape(-1), size)
+    if d.kind == "normal":
+        return np.diag(width**2)
+    if d.kind == "truncated":
+        from scipy.stats import truncnorm
+
+        return np.diag(width**2 * truncnorm.var(-d.limit, d.limit))
+    width = np.log(width) if d.kind == "log_uniform" else width
+    return np.diag(width**2 / 3)
+
+
+def _effect(d: Dispersion, nominal: FloatArray) -> FloatArray:
+    """What a draw changes a parameter by: itself; of a factor's logarithm, to first order."""
+    return np.diag(nominal) if d.kind == "log_uniform" else np.eye(len(nominal))
