@@ -39,7 +39,10 @@ NAVIGATION = {
     *("latitude", "longitude", "lvlh", "mekf", "navigation", "orbit", "quaternion", "radar"),
     *("sar", "satellite", "spacecraft", "terrain", "velocity"),
 }
-LATE = "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy psutil filelock platformdirs"
+LATE = (
+    "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy "
+    "psutil filelock platformdirs tomlkit jinja2"
+)
 HEAVY = {
     "terrafix": f"numpy click {LATE}",
     "terrafix.cosim.system.system": LATE,

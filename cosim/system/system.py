@@ -372,7 +372,7 @@ class System(Shown):
 
         return Record(record.name, tuple(leaf(p) for p in record.ports), record.rate)
 
-    def check(self, duration: Exact | None = None) -> Plan:
+    def check(self, duration: Exact | None = None, *, outside: bool = False) -> Plan:
         """Check the system whole, and give what it comes down to: order, base step, notes.
 
         Parameters
@@ -380,6 +380,8 @@ class System(Shown):
         duration : exact time, optional
             Of the run that is meant [s], the system's own if absent: recordings that end before
             it are found too.
+        outside : bool
+            Whether exposed inputs are driven from outside, as in an exported system.
 
         Raises
         ------
@@ -389,7 +391,7 @@ class System(Shown):
         from terrafix.cosim.system.check import check
 
         length = self.duration if duration is None else _positive(duration, "duration")
-        return check(self, duration=length)
+        return check(self, duration=length, outside=outside)
 
     @overload
     def graph(self, path: None = None) -> Diagram: ...
