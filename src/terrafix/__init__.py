@@ -46,9 +46,9 @@ if TYPE_CHECKING:
     from terrafix.cosim.declare.ports import SharedOutput as SharedOutput
     from terrafix.cosim.declare.ports import State as State
     from terrafix.cosim.declare.ports import WindowInput as WindowInput
+    from terrafix.cosim.engine.result import Result as Result
     from terrafix.cosim.engine.run import RunError as RunError
     from terrafix.cosim.engine.run import simulate as simulate
-    from terrafix.cosim.engine.result import Result as Result
     from terrafix.cosim.engine.simulation import Simulation as Simulation
     from terrafix.cosim.exchange.fmi.check.check import check_fmu as check_fmu
     from terrafix.cosim.exchange.fmi.write.export import export_fmu as export_fmu
