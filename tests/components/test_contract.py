@@ -14,7 +14,7 @@ import xarray
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.component import Component, docstring
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import BundleOutput, MessageOutput, Output
 from terrafix.cosim.declare.registry import component_entries, component_type
@@ -207,7 +207,7 @@ def test_a_state_set_back_continues_to_the_same_bytes(build, tmp_path):
 @pytest.mark.parametrize("name", TYPES)
 def test_ports_and_parameters_say_what_they_are(name):
     kind = component_type(name)
-    assert kind.__doc__
+    assert docstring(kind)
     for name, declared in kind.declarations.items():
         if isinstance(declared, Parameter) or not hasattr(declared, "fields"):
             assert declared.doc, f"{kind.__name__}.{name} has no doc"

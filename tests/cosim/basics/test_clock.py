@@ -178,3 +178,23 @@ def test_a_recorder_does_not_move_what_is_snapped(toys):
         return simulation.recorders[0].history()[0].tolist()
 
     assert run() == run("0.001") == [1.0, 1.5]
+
+
+@pytest.mark.parametrize(
+    ("rate", "text"),
+    [
+        (Rate("8.2"), 'Rate("8.2 s")'),
+        (Rate(hz=3, offset="10 ms"), 'Rate("1/3 s", offset="0.01 s")'),
+        (Rate(times=["0", "1/7"]), 'Rate(times=["0 s", "1/7 s"])'),
+    ],
+)
+def test_a_rate_can_be_pasted_back(rate, text):
+    assert repr(rate) == text
+    assert eval(text) == rate
+
+
+def test_a_long_list_of_times_is_cut_and_counted():
+    shown = repr(Rate(times=list(range(20))))
+    assert shown == 'Rate(times=["0 s", "1 s", "2 s", "3 s", ..., "19 s"])  # 20 times'
+    with pytest.raises(RateError):  # pasted back, it is refused rather than something else
+        eval(shown)
