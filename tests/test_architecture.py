@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -125,6 +126,7 @@ FOREIGN = {
 """Underscore names of others that are used, and why."""
 
 
+@cache
 def touched(path: Path) -> set[str]:
     """Underscore names that a module uses though it did not define them."""
     tree = ast.parse(path.read_text())

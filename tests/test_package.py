@@ -7,16 +7,12 @@ import sys
 import zipfile
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 LEFTOVERS = shutil.ignore_patterns("__pycache__", "*.egg-info")
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    """Built from a copy: what earlier builds left in the checkout must not get into it."""
-    folder = tmp_path_factory.mktemp("wheel")
+def build(folder):
+    """Build from a copy: what earlier builds left in the checkout must not get into it."""
     source = folder / "source"
     for name in ("models", "cosim", "components", "src"):
         shutil.copytree(ROOT / name, source / name, ignore=LEFTOVERS)
@@ -28,9 +24,11 @@ def wheel(tmp_path_factory):
     return file
 
 
-def test_the_wheel_holds_the_house_and_nothing_else(wheel):
-    with zipfile.ZipFile(wheel) as archive:
+def test_the_wheel_is_the_house_and_flies_an_example(tmp_path):
+    """All of its files and nothing else; unpacked in front of the checkout, it runs."""
+    with zipfile.ZipFile(build(tmp_path)) as archive:
         packed = set(archive.namelist())
+        archive.extractall(tmp_path / "site")
     wings = {
         "models": "terrafix/models",
         "cosim": "terrafix/cosim",
@@ -45,12 +43,6 @@ def test_the_wheel_holds_the_house_and_nothing_else(wheel):
         if path.suffix in kinds or path.name == "py.typed"
     }
     assert {p for p in packed if p.startswith("terrafix/")} == expected
-
-
-def test_the_wheel_flies_an_example(wheel, tmp_path):
-    """Unpacked beside the dependencies, in front of the editable install of the checkout."""
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(tmp_path / "site")
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r})\n"
         "sys.meta_path = [f for f in sys.meta_path if 'editable' not in str(f)]\n"
