@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from terrafix.components.fields import XYZ
+from terrafix.components.noisy import NoisyComponent
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import Input, Output
@@ -40,7 +41,7 @@ class LvlhAttitude(SymbolicComponent):
         return lvlh_attitude_model(self.velocity)
 
 
-class AttitudeSensor(SymbolicComponent):
+class AttitudeSensor(NoisyComponent):
     """Attitude determination system: the true attitude with white noise and a constant bias."""
 
     default_rate = Rate(hz=100)
