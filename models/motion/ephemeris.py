@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray
+from terrafix.models.geometry.earth import EARTH
 
 MAX_BYTES = 64 * 1024 * 1024
 """Largest orbit file read; a day of state vectors every 10 s takes 5 MB."""
@@ -153,6 +154,13 @@ def read_eof(path: str | Path) -> Ephemeris:
         _refuse_leap_seconds(path, utc)
     states = np.array([_state(path, i, osv) for i, osv in enumerate(vectors)], np.float64)
     states = states.reshape(-1, 6)
+    distance = np.linalg.norm(states[:, :3], axis=1)
+    if np.any(distance < EARTH.polar_radius):
+        k = int(np.argmin(distance))
+        raise ValueError(
+            f"{path}: state vector {k} lies inside the Earth, {distance[k]:.6g} m from its center; "
+            "positions are in meters"
+        )
     try:
         return Ephemeris(utc, t, states[:, :3].copy(), states[:, 3:].copy())
     except ValueError as error:

@@ -58,6 +58,10 @@ def test_a_small_file(tmp_path, namespace):
         ({"change": lambda t: t.replace("UTC=2022-09-18T05:31:20.250000", "NaT")}, "the epoch"),
         ({"vectors": GOOD[::-1]}, "epochs do not increase from number 0 to 1"),
         ({"vectors": GOOD[:1]}, "wants two epochs at least, got 1"),
+        (
+            {"change": lambda t: t.replace("7000001.0", "7000.0")},
+            "1 lies inside the Earth, 7000",
+        ),
         ({"vectors": []}, "wants two epochs at least, got 0"),
         ({"change": lambda t: t.replace("<Earth", "<!DOCTYPE a><Earth", 1)}, "document type"),
         ({"change": lambda t: ""}, "damaged or truncated"),
