@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from terrafix.components.truth.attitude import LvlhAttitude
 from terrafix.components.truth.orbit import OrbitTruth
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import SystemCheckError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.ports import Output
 from terrafix.cosim.engine.run import RunError, simulate
 from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.cosim.system.system import System
@@ -79,3 +82,78 @@ def test_a_member_that_starts_inside_the_earth_fails_at_once():
 def test_an_orbit_that_overflows_is_not_said_to_be_in_the_earth():
     with pytest.raises(RunError, match="result is not finite"):
         simulate(orbit_system(j2=1e300), duration="10")
+
+
+class Flight(Component):
+    """A position on the x axis, and for each member and step the velocities it is given."""
+
+    r_e = Output((3,), unit="m", frame="e")
+    v_e = Output((3,), unit="m/s", frame="e")
+    velocities: np.ndarray  # (members, steps, 3)
+
+    def _initialize_impl(self):
+        self.r_e = R0
+        self.v_e = self.velocities[:, 0]
+
+    def _step_impl(self, t, dt):
+        self.v_e = self.velocities[:, min(self.step_index, self.velocities.shape[1] - 1)]
+
+
+def attitudes(velocities, **options):
+    """Attitude of each member, which fly along their velocities, one a second."""
+    system = System("flight")
+    flight = system.add(Flight(rate=Rate("1")), "flight")
+    flight.velocities = np.array(velocities, float)
+    attitude = system.add(LvlhAttitude(rate=Rate("1"), **options), "attitude")
+    system.connect(flight["r_e"], attitude["r_e"])
+    system.connect(flight["v_e"], attitude["v_e"])
+    system.record("q", [attitude["q_be"], attitude["delta_theta_b"]], period="1 s")
+    return simulate(system, members=len(velocities), duration="3")
+
+
+EAST, NORTH, UP = [0.0, 7e3, 0.0], [0.0, 0.0, 7e3], [7e3, 0.0, 0.0]
+LEVEL = "level axes are undefined: the velocity is zero or vertical"
+HALF = "it turned by half a turn in a step: its sign and rate are undefined"
+
+
+@pytest.mark.parametrize(
+    ("second", "reason"),
+    [
+        ([0.0, 0.0, 0.0], LEVEL),
+        (UP, LEVEL),
+        ([-7e3, 0.0, 0.0], LEVEL),
+        ([7e3, 1e-9, 0.0], LEVEL),
+        ([0.0, -7e3, 0.0], HALF),
+        ([0.0, -7e3, 1e-9], HALF),
+    ],
+)
+def test_an_attitude_that_is_undefined_fails_its_member_alone(second, reason):
+    result = attitudes([[EAST, EAST, second, EAST], [EAST, NORTH, NORTH, EAST]])
+    (failure,) = result.excluded
+    assert (failure["member"], failure["component"], failure["t_s"]) == (0, "attitude", 2.0)
+    assert failure["reason"] == reason
+    q = result.dataset["attitude.q_be"].to_numpy()
+    assert np.isnan(q[2:, 0]).all()
+    np.testing.assert_allclose(np.linalg.norm(q[:, 1], axis=-1), 1.0, rtol=1e-14)
+
+
+def test_an_attitude_that_is_undefined_at_the_start_says_so():
+    result = attitudes([[UP, EAST], [EAST, EAST]])
+    (failure,) = result.excluded
+    assert (failure["member"], failure["t_s"], failure["reason"]) == (0, 0.0, LEVEL)
+
+
+def test_inertial_level_axes_follow_the_inertial_velocity():
+    """Hanging above a place of the Earth has no Earth-fixed velocity, but an inertial one."""
+    rest, against = [0.0] * 3, [0.0, -EARTH.rotation_rate * R0[0], 0.0]
+    assert not attitudes([[rest, rest, rest]], velocity="inertial").excluded
+    with pytest.raises(RunError, match=LEVEL):
+        attitudes([[rest, rest, against]], velocity="inertial")
+
+
+def test_a_turn_just_short_of_half_is_told():
+    """179.9 deg to the left, about the axis down: -179.9 deg about z, less the Earth's turn."""
+    angle = np.radians(179.9)
+    turned = [0.0, 7e3 * np.cos(angle), 7e3 * np.sin(angle)]
+    found = attitudes([[EAST, turned]], rotation_rate=0.0).dataset["attitude.delta_theta_b"]
+    np.testing.assert_allclose(found.to_numpy()[1, 0], [0.0, 0.0, -angle], atol=1e-12)
