@@ -99,6 +99,7 @@ class Dem:
             ahead, behind = (self.at(latitude + s * north, longitude) for s in (1, -1))
             right, left = (self.at(latitude, longitude + s * east) for s in (1, -1))
             return (ahead - behind) / (2 * meridian), (right - left) / (2 * parallel)
+        longitude = longitude - 2 * np.pi * self._turns(longitude)
         lat1, lat0 = (np.clip(latitude + s * north, *self._span(0)) for s in (1, -1))
         lon1, lon0 = (np.clip(longitude + s * east, *self._span(1)) for s in (1, -1))
         rise_n = self.at(lat1, longitude) - self.at(lat0, longitude)
@@ -173,9 +174,14 @@ class Dem:
         y = (np.asarray(latitude, np.float64) - self.latitude0) / self.latitude_step
         middle = sum(self._span(1)) / 2
         turn = np.asarray(longitude, np.float64) - middle
-        turn = turn - 2 * np.pi * np.rint(turn / (2 * np.pi))
+        turn = turn - 2 * np.pi * self._turns(longitude)
         x = (turn + middle - self.longitude0) / self.longitude_step
         return y, x
+
+    def _turns(self, longitude: ArrayLike) -> FloatArray:
+        """Whole turns from the middle of the model to longitudes [rad]."""
+        middle = sum(self._span(1)) / 2
+        return np.asarray(np.rint((np.asarray(longitude, np.float64) - middle) / (2 * np.pi)))
 
     def _cell(self, latitude: ArrayLike, longitude: ArrayLike) -> tuple[np.ndarray, ...]:
         """Row and column of the cell's southwestern corner, and the place within it."""

@@ -170,3 +170,15 @@ def test_bad_files_are_refused_by_name(tmp_path):
     (tmp_path / "torn.npz").write_bytes((tmp_path / "map.npz").read_bytes()[:100])
     with pytest.raises(ValueError, match=r"torn\.npz' is not an elevation model: it is damaged"):
         read_dem(tmp_path / "torn.npz")
+
+
+@pytest.mark.parametrize("turns", [-1, 0, 1])
+def test_slopes_do_not_depend_on_the_turn(turns):
+    """A model across 180 degrees rises by 90 m a cell to the east; asked from either side."""
+    step = np.radians(1e-3)
+    height = np.broadcast_to(90.0 * np.arange(21), (21, 21)).astype(np.float32)
+    dem = Dem(height, 0.0, np.radians(180.0) - 10 * step, step, step)
+    longitude = np.radians(180.0) + np.array([-3.0, 0.0, 3.0]) * step + 2 * np.pi * turns
+    north, east = dem.slopes(np.full(3, 10 * step), longitude)
+    np.testing.assert_allclose(east, 90.0 / (6371e3 * step * np.cos(10 * step)), rtol=1e-6)
+    np.testing.assert_allclose(north, 0.0, atol=1e-9)
