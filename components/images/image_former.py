@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from terrafix.components.fields import ACQUISITION, ESTIMATE, IMAGE
 from terrafix.components.sensors.echo import ECHO, RADAR
+from terrafix.components.shared import require_common
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -84,11 +85,22 @@ class ImageFormer(Component):
     )
     image = MessageOutput(fields=IMAGE, doc="which image is a member's, and what it measures")
 
+    def initialize(self) -> None:
+        """Look whether what forms images is common to all members."""
+        require_common(self, "velocity_step", "migration_step", "band", "exposure")
+        super().initialize()
+
     def _step_impl(self, t: float, dt: float) -> None:
         fresh = self.acquired.fresh & self.environment.active
         if not fresh.any():
             return
         k = int(np.argmax(fresh))
+        for name in ("near_range", "first_time"):
+            if np.any(getattr(self.acquired, name)[fresh] != getattr(self.acquired, name)[k]):
+                raise ConfigurationError(
+                    f"'{self.name}.acquired.{name}' differs between members, but one echo is "
+                    "shared by all of them\n  fly one member at a time"
+                )
         try:
             imager = Imager(
                 self.echo,

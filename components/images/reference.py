@@ -12,13 +12,13 @@ import numpy as np
 from terrafix.components.images.matcher import AMPLITUDE, PLACES, TIES
 from terrafix.components.sensors.echo import (
     RADAR,
-    common,
     file_of_step,
     generator,
     read_lines,
     recorded_files,
     require_files,
 )
+from terrafix.components.shared import common, require_common
 from terrafix.components.truth.terrain import GRID, HEIGHT, SURFACE, dem_from, scene_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -45,6 +45,9 @@ class _Reference(Component):
     tie_rows = SharedOutput(**TIES, doc="rows of its tie points")
     tie_columns = SharedOutput(**TIES, doc="columns of its tie points")
     places = SharedOutput(**PLACES, doc="latitude, longitude, height of its tie points")
+
+    def _initialize_impl(self) -> None:
+        require_common(self)
 
     def _publish(self, reference: Reference) -> None:
         self.amplitude = np.ascontiguousarray(reference.amplitude, np.float32)

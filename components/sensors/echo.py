@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from terrafix.components.fields import ACQUISITION, RADAR_LABELS, RADAR_UNITS
+from terrafix.components.shared import common, require_common, shared_setting
 from terrafix.components.truth.terrain import GRID, HEIGHT, SURFACE, dem_from, scene_from
-from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.basics.machine import require_memory
@@ -64,13 +64,14 @@ class _Echo(Component):
         self._radar()
 
     def _radar(self) -> Radar:
-        values = [np.asarray(self.setting(name)) for name in Radar.__dataclass_fields__]
+        values = [shared_setting(self, name) for name in Radar.__dataclass_fields__]
         try:
             return Radar(*map(float, values))
         except ValueError as error:
             raise ConfigurationError(f"the radar of '{self.name}' cannot be: {error}") from error
 
     def _initialize_impl(self) -> None:
+        require_common(self)
         radar = self._radar()
         self.radar = np.array([getattr(radar, name) for name in Radar.__dataclass_fields__])
 
@@ -191,12 +192,12 @@ class RecordedEcho(_Echo):
             self._check_time(read_lines(self, path), path, t)
 
     def _first_time(self, lines: RecordedLines) -> float:
-        start = float(np.ravel(self.setting("start_line"))[0])
-        return (lines.first_line - start) / float(self.setting("prf"))
+        start, prf = (float(shared_setting(self, name)) for name in ("start_line", "prf"))
+        return (lines.first_line - start) / prf
 
     def _check_time(self, lines: RecordedLines, path: Path, t: float) -> None:
         first = self._first_time(lines)
-        last = first + (len(lines.echo) - 1) / float(self.setting("prf"))
+        last = first + (len(lines.echo) - 1) / float(shared_setting(self, "prf"))
         if not first <= t <= last:
             raise ConfigurationError(
                 f"'{self.name}' is to publish '{path.name}' at {t:g} s, but its lines were "
@@ -211,18 +212,6 @@ class RecordedEcho(_Echo):
         near = float(common(self, "range0"))
         near += (lines.first_cell - 1) * self._radar().range_spacing
         self._publish(t, lines.echo, self._first_time(lines), near)
-
-
-def common(component: Component, name: str) -> FloatArray:
-    """What is the same for all active members."""
-    values = np.asarray(getattr(component, name))[component.environment.active]
-    if len(values) > 1 and np.any(values != values[:1]):
-        raise ConfigurationError(
-            f"'{component.name}.{name}' differs between members, but its output is one for all\n"
-            "  fly members with one truth: disperse what is known at the start and the sensors, "
-            "not the orbit, the attitude or the antenna; or fly one member at a time"
-        )
-    return np.asarray(values[0])
 
 
 def generator(component: Component) -> np.random.Generator:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.components.fields import GRID_LABELS, GRID_UNITS
+from terrafix.components.shared import require_common, shared_setting
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -59,7 +60,7 @@ class Terrain(Component):
     def _read(self) -> Dem:
         source, path = self.setting("source"), self.setting("dem_file")
         if source == "flat":
-            return flat_dem(float(self.setting("flat_height")))
+            return flat_dem(float(shared_setting(self, "flat_height")))
         if source == "file" and path is None:
             raise ConfigurationError(
                 f"'{self.name}' needs an elevation model\n"
@@ -81,6 +82,7 @@ class Terrain(Component):
         return dem.tiled() if self.setting("mirrored") else dem
 
     def _initialize_impl(self) -> None:
+        require_common(self)
         dem = self._read()
         self.height = dem.height
         self.grid = np.array(
@@ -99,8 +101,6 @@ class Terrain(Component):
             self.point_density,
             self.point_brightness,
         )
-        if any(np.ptp(s) for s in strengths):
-            raise ConfigurationError(f"the surface of '{self.name}' differs between members")
         self.surface = np.array([float(self.surface_seed), *(float(s[0]) for s in strengths)])
 
     def _step_impl(self, t: float, dt: float) -> None:

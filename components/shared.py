@@ -1,0 +1,42 @@
+"""What one output for all members is made of must be the same for all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Parameter
+
+
+def common(component: Component, name: str) -> FloatArray:
+    """What is the same for all active members."""
+    values = np.asarray(getattr(component, name))[component.environment.active]
+    if len(values) > 1 and np.any(values != values[:1]):
+        raise ConfigurationError(
+            f"'{component.name}.{name}' differs between members, but its output is one for all\n"
+            "  fly members with one truth: disperse what is known at the start and the sensors, "
+            "not the orbit, the attitude or the antenna; or fly one member at a time"
+        )
+    return np.asarray(values[0])
+
+
+def require_common(component: Component, *names: str) -> None:
+    """Raise ConfigurationError if parameters differ between members; all of them by default."""
+    declared = [n for n, s in component.settings().items() if isinstance(s, Parameter)]
+    for name in names or declared:
+        values = np.asarray(getattr(component, name))
+        if np.any(values != values[:1]):
+            raise ConfigurationError(
+                f"'{component.name}.{name}' differs between members, but what "
+                f"'{component.name}' makes with it is one for all\n"
+                "  leave it out of the dispersions, or fly one member at a time"
+            )
+
+
+def shared_setting(component: Component, name: str) -> FloatArray:
+    """A numeric parameter that all members share, in a run as before it."""
+    if component._environment is None:
+        return np.asarray(component.setting(name))
+    return np.asarray(getattr(component, name)[0])
