@@ -49,7 +49,9 @@ class ImageFormer(Component):
 
     default_rate = Rate("8.2", offset="8.2")
 
-    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    look = Parameter(
+        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+    )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     velocity_step = Parameter(1.0, unit="m/s", positive=True, doc="grid of autofocus")
     migration_step = Parameter(

@@ -63,7 +63,9 @@ class EarlierPass(_Reference):
     of the truth, displaced. It is centered where the nominal boresight meets the ground.
     """
 
-    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    look = Parameter(
+        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+    )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     displacement = Parameter(
         [0.0, 300.0, 150.0],
@@ -127,7 +129,9 @@ class RecordedReference(_Reference):
     band = Parameter(
         [0.0, 1.0], shape=(2,), minimum=0.0, maximum=1.0, doc="part of the Doppler band shown"
     )
-    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    look = Parameter(
+        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+    )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     exposure = Parameter(
         1.0, positive=True, maximum=1.0, doc="share of a pulse received where columns are used"

@@ -45,7 +45,9 @@ class _Echo(Component):
     chirp_rate = Parameter(unit="Hz/s", doc="sweep of the pulse, negative downward")
     pulse_length = Parameter(unit="s", positive=True, doc="of the pulse")
     doppler_bandwidth = Parameter(unit="Hz", positive=True, doc="processed, at most the prf")
-    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    look = Parameter(
+        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+    )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
 
     r_e = Input((3,), unit="m", frame="e", doc="true position")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,10 @@ from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import SharedOutput
-from terrafix.models.maps.dem import Dem, flat_dem, read_dem, read_jacksboro
+from terrafix.models.maps.dem import HIGHEST, LOWEST, Dem, flat_dem, read_dem, read_jacksboro
 from terrafix.models.radar.scene import Scene
 
+_log = logging.getLogger(__name__)
 SOURCES = ("file", "jacksboro", "flat")
 HEIGHT: dict[str, Any] = {"shape": (None, None), "unit": "m", "dtype": np.float32}
 GRID: dict[str, Any] = {"shape": (5,), "unit": GRID_UNITS, "labels": GRID_LABELS}
@@ -39,9 +41,11 @@ class Terrain(Component):
         doc="file; jacksboro: the real one that comes with matplotlib; flat: one height",
     )
     dem_file = OptionalFilePath(doc="tile of SRTM (.hgt) or arrays (.npz)")
-    flat_height = Parameter(0.0, unit="m", doc="height everywhere (flat); 0 is the sea")
+    flat_height = Parameter(
+        0.0, unit="m", minimum=LOWEST, maximum=HIGHEST, doc="height everywhere (flat); 0 is the sea"
+    )
     mirrored = Flag(False, doc="go on for ever in mirror images: artificial, without borders")
-    fill_voids = Flag(False, doc="interpolate voids instead of refusing them")
+    fill_voids = Flag(False, doc="interpolate voids, and say so, instead of refusing them")
     surface_seed = Count(0, doc="of texture and bright points")
     parcels = Parameter(2.5, minimum=0.0, doc="texture with sharp borders, standard deviation [dB]")
     smooth = Parameter(1.5, minimum=0.0, doc="smooth texture, standard deviation [dB]")
@@ -68,7 +72,8 @@ class Terrain(Component):
             )
         try:
             dem = read_jacksboro() if source == "jacksboro" else read_dem(path)
-            dem = dem.filled() if self.setting("fill_voids") else dem
+            self._n_filled = dem.n_void if self.setting("fill_voids") else 0
+            dem = dem.filled() if self._n_filled else dem
         except (OSError, ValueError) as error:
             raise ConfigurationError(
                 f"'{self.name}' cannot read its elevation model: {error}\n"
@@ -84,6 +89,11 @@ class Terrain(Component):
     def _initialize_impl(self) -> None:
         require_common(self)
         dem = self._read()
+        if self._n_filled:
+            _log.warning(
+                "'%s' filled %d void points of the %d of '%s' by interpolation from their rims",
+                *(self.name, self._n_filled, dem.height.size, dem.name),
+            )
         self.height = dem.height
         self.grid = np.array(
             [

@@ -23,7 +23,11 @@ KEYS = ("height_m", "latitude0_deg", "longitude0_deg", "latitude_step_deg", "lon
 JACKSBORO = "jacksboro"
 """Name of the elevation model that comes with matplotlib: 36.3 N, 84.25 W, of SRTM."""
 
-_VOID = -32768
+VOIDS = (-32768.0, -32767.0, -9999.0)
+"""What files write where no height is known: SRTM, DTED, and most others."""
+LOWEST, HIGHEST = -12_000.0, 9_000.0
+"""Bounds of the Earth's heights and depths [m]: the Challenger Deep and Everest lie within."""
+
 _SIZES = {1201 * 1201 * 2: 1201, 3601 * 3601 * 2: 3601}
 
 
@@ -212,8 +216,23 @@ def flat_dem(height: float = 0.0) -> Dem:
     return Dem(grid, 0.0, 0.0, 1.0, 1.0, "a flat elevation model", mirrored=True)
 
 
+def _heights(raw: NDArray[Any], path: Path) -> Single:
+    """Heights as a file holds them, voids as NaN; what the Earth does not have is refused."""
+    height = np.array(raw, np.float32)
+    height[np.isin(height, np.array(VOIDS, np.float32))] = np.nan
+    wrong = (height < LOWEST) | (height > HIGHEST)
+    if wrong.any():
+        i, j = (int(k) for k in np.argwhere(wrong)[0])
+        raise ValueError(
+            f"'{path}': {int(wrong.sum())} of its {height.size} heights are beyond {LOWEST:.0f} to "
+            f"{HIGHEST:.0f} m, the first is {height[i, j]:g} m in row {i}, column {j}\n"
+            "  heights are in meters; write NaN where none is known"
+        )
+    return height
+
+
 def read_hgt(path: Path) -> Dem:
-    """Read a tile of SRTM (.hgt): big-endian 16-bit, 1201 or 3601 square, -32768 where void.
+    """Read a tile of SRTM (.hgt): big-endian 16-bit, 1201 or 3601 square, `VOIDS` where void.
 
     The name (N44W072) gives its southwestern corner; its first row is the northernmost.
 
@@ -236,7 +255,7 @@ def read_hgt(path: Path) -> Dem:
         )
     n = _SIZES[size]
     raw = np.fromfile(path, ">i2").reshape(n, n)[::-1]
-    height = np.where(raw == _VOID, np.nan, raw).astype(np.float32)
+    height = _heights(raw, path)
     ns, lat, ew, lon = found.groups()
     south = int(lat) * (1 if ns == "N" else -1)
     west = int(lon) * (1 if ew == "E" else -1)
@@ -288,7 +307,7 @@ def read_dem(path: Path) -> Dem:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If it cannot be read.
+        If it cannot be read, or holds what is no height of the Earth.
     """
     if path.suffix.lower() == ".hgt":
         return read_hgt(path)
@@ -297,6 +316,7 @@ def read_dem(path: Path) -> Dem:
     arrays = read_arrays(path, KEYS, "an elevation model")
     try:
         south, west, north, east = (float(np.radians(float(arrays[k]))) for k in KEYS[1:])
-        return Dem(np.asarray(arrays["height_m"], np.float32), south, west, north, east, path.name)
+        return Dem(_heights(arrays["height_m"], path), south, west, north, east, path.name)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"'{path}': {error}") from error
+        told = str(error)
+        raise ValueError(told if str(path) in told else f"'{path}': {told}") from error
