@@ -7,6 +7,7 @@ import numpy as np
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Parameter
 
 
 def common(component: Component, name: str) -> FloatArray:
@@ -26,3 +27,23 @@ def generator(component: Component) -> np.random.Generator:
     env = component.environment
     words = [env.seed & 0xFFFFFFFF, env.seed >> 32, component.step_index, *env.path.encode()]
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
+
+
+def require_common(component: Component, *names: str) -> None:
+    """Raise ConfigurationError if parameters differ between members; all of them by default."""
+    declared = [n for n, s in component.settings().items() if isinstance(s, Parameter)]
+    for name in names or declared:
+        values = np.asarray(getattr(component, name))
+        if np.any(values != values[:1]):
+            raise ConfigurationError(
+                f"'{component.name}.{name}' differs between members, but what "
+                f"'{component.name}' makes with it is one for all\n"
+                "  leave it out of the dispersions, or fly one member at a time"
+            )
+
+
+def shared_setting(component: Component, name: str) -> FloatArray:
+    """A numeric parameter that all members share, in a run as before it."""
+    if component.lent is None:
+        return np.asarray(component.setting(name))
+    return np.asarray(getattr(component, name)[0])

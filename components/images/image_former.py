@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from terrafix.components.fields import ACQUISITION, ECHO, ESTIMATE, IMAGE, RADAR
+from terrafix.components.shared import require_common
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -45,7 +46,9 @@ class ImageFormer(Component):
 
     default_rate = Rate("8.2", offset="8.2")
 
-    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    look = Parameter(
+        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+    )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     velocity_step = Parameter(1.0, unit="m/s", positive=True, doc="grid of autofocus")
     migration_step = Parameter(
@@ -81,11 +84,22 @@ class ImageFormer(Component):
     )
     image = MessageOutput(fields=IMAGE, doc="which image is a member's, and what it measures")
 
+    def initialize(self) -> None:
+        """Look whether what forms images is common to all members."""
+        require_common(self, "velocity_step", "migration_step", "band", "exposure")
+        super().initialize()
+
     def _step_impl(self, t: float, dt: float) -> None:
         fresh = self.acquired.fresh & self.environment.active
         if not fresh.any():
             return
         k = int(np.argmax(fresh))
+        for name in ("near_range", "first_time"):
+            if np.any(getattr(self.acquired, name)[fresh] != getattr(self.acquired, name)[k]):
+                raise ConfigurationError(
+                    f"'{self.name}.acquired.{name}' differs between members, but one echo is "
+                    "shared by all of them\n  fly one member at a time"
+                )
         try:
             imager = Imager(
                 self.echo,

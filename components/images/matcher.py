@@ -144,6 +144,7 @@ class ImageMatcher(Component):
         r, v, P = (getattr(self.prior, k)[fresh] for k in ("r_e", "v_e", "P"))
         p = ground_point(r, v, self.image.slant_range[fresh], self.image.sine[fresh])
         latitude, longitude, _ = geodetic(p)
+        longitude = reference.own_turn(longitude)
         sigma = np.sqrt(np.trace(P[:, :3, :3], axis1=1, axis2=2))
         sigma += self.image.slant_range[fresh] * np.sqrt(np.trace(P[:, 6:, 6:], axis1=1, axis2=2))
         reach = 3 * sigma / 6.371e6

@@ -16,7 +16,7 @@ from terrafix.components.sensors.files import (
     recorded_files,
     require_files,
 )
-from terrafix.components.shared import common, generator
+from terrafix.components.shared import common, generator, require_common
 from terrafix.components.truth.terrain import dem_from, scene_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -44,6 +44,9 @@ class _Reference(Component):
     tie_columns = SharedOutput(**TIES, doc="columns of its tie points")
     places = SharedOutput(**PLACES, doc="latitude, longitude, height of its tie points")
 
+    def _initialize_impl(self) -> None:
+        require_common(self)
+
     def _publish(self, reference: Reference) -> None:
         self.amplitude = np.ascontiguousarray(reference.amplitude, np.float32)
         self.tie_rows = np.asarray(reference.rows, np.float64)
@@ -58,7 +61,9 @@ class EarlierPass(_Reference):
     of the truth, displaced. It is centered where the nominal boresight meets the ground.
     """
 
-    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    look = Parameter(
+        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+    )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     displacement = Parameter(
         [0.0, 300.0, 150.0],
@@ -122,7 +127,9 @@ class RecordedReference(_Reference):
     band = Parameter(
         [0.0, 1.0], shape=(2,), minimum=0.0, maximum=1.0, doc="part of the Doppler band shown"
     )
-    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    look = Parameter(
+        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+    )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     exposure = Parameter(
         1.0, positive=True, maximum=1.0, doc="share of a pulse received where columns are used"

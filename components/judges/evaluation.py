@@ -47,10 +47,10 @@ class NavigationEvaluation(Evaluation):
     misalignment_sigma = Output((3,), unit="rad", frame="s", labels=XYZ)
     covariance = Output((9, 9), unit="1", doc="predicted, in SI: m, m/s, rad")
     normalized_innovation = Output(
-        (4,), doc="innovation of the fix of this instant over its sigma; NaN where not measured"
+        (4,), doc="innovation of this instant's accepted fix over its sigma; NaN where not measured"
     )
     nees = Output(doc="normalized estimation error squared, 9 degrees of freedom")
-    nis = Output(doc="normalized innovation squared of the fix of this instant")
+    nis = Output(doc="normalized innovation squared of this instant's fix, if accepted")
     nis_dof = Output(doc="elements in that fix")
     accepted = Output(doc="1 if that fix was accepted, 0 if not")
     reason = Output(doc="index into terrafix.models.filters.spacecraft.REASONS")
@@ -75,12 +75,15 @@ class NavigationEvaluation(Evaluation):
         self.nees = normalized_square(error, estimate.P)
         self.covariance = estimate.P
         fresh = self.innovation.fresh
-        measured = fresh[:, None] & (self.innovation.residual != 0.0)
+        # a fix that was refused says why in `reason`, and nothing of the filter's consistency
+        used = fresh & (self.innovation.accepted > 0.5)
+        residual, sigma = self.innovation.residual, self.innovation.sigma
+        measured = used[:, None] & ((residual != 0.0) | (sigma != 1.0))
         self.normalized_innovation = np.where(
-            measured, self.innovation.residual / self.innovation.sigma, np.nan
+            measured, residual / np.where(measured, sigma, 1.0), np.nan
         )
-        self.nis = np.where(fresh, self.innovation.nis, np.nan)
-        self.nis_dof = np.where(fresh, self.innovation.dof, np.nan)
+        self.nis = np.where(used, self.innovation.nis, np.nan)
+        self.nis_dof = np.where(used, self.innovation.dof, np.nan)
         self.accepted = np.where(fresh, self.innovation.accepted, np.nan)
         self.reason = np.where(fresh, self.innovation.reason, np.nan)
 

@@ -19,7 +19,7 @@ from terrafix.components.sensors.files import (
     recorded_files,
     require_files,
 )
-from terrafix.components.shared import common, generator
+from terrafix.components.shared import common, generator, require_common, shared_setting
 from terrafix.components.truth.terrain import dem_from, scene_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -49,7 +49,9 @@ class _Echo(Component):
     chirp_rate = Parameter(unit="Hz/s", doc="sweep of the pulse, negative downward")
     pulse_length = Parameter(unit="s", positive=True, doc="of the pulse")
     doppler_bandwidth = Parameter(unit="Hz", positive=True, doc="processed, at most the prf")
-    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    look = Parameter(
+        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+    )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
 
     r_e = Input((3,), unit="m", frame="e", doc="true position")
@@ -68,13 +70,14 @@ class _Echo(Component):
         self._radar()
 
     def _radar(self) -> Radar:
-        values = [np.asarray(self.setting(name)) for name in Radar.__dataclass_fields__]
+        values = [shared_setting(self, name) for name in Radar.__dataclass_fields__]
         try:
             return Radar(*map(float, values))
         except ValueError as error:
             raise ConfigurationError(f"the radar of '{self.name}' cannot be: {error}") from error
 
     def _initialize_impl(self) -> None:
+        require_common(self)
         radar = self._radar()
         self.radar = np.array([getattr(radar, name) for name in Radar.__dataclass_fields__])
 
@@ -195,12 +198,12 @@ class RecordedEcho(_Echo):
             self._check_time(read_lines(self, path), path, t)
 
     def _first_time(self, lines: RecordedLines) -> float:
-        start = float(np.ravel(self.setting("start_line"))[0])
-        return (lines.first_line - start) / float(self.setting("prf"))
+        start, prf = (float(shared_setting(self, name)) for name in ("start_line", "prf"))
+        return (lines.first_line - start) / prf
 
     def _check_time(self, lines: RecordedLines, path: Path, t: float) -> None:
         first = self._first_time(lines)
-        last = first + (len(lines.echo) - 1) / float(self.setting("prf"))
+        last = first + (len(lines.echo) - 1) / float(shared_setting(self, "prf"))
         if not first <= t <= last:
             raise ConfigurationError(
                 f"'{self.name}' is to publish '{path.name}' at {t:g} s, but its lines were "

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from terrafix.components.fields import FIX
+from terrafix.components.noisy import NoisyComponent
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import Input, MessageOutput, Output
-from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.sensors.sar import (
@@ -17,7 +17,7 @@ from terrafix.models.sensors.sar import (
 )
 
 
-class AntennaMount(SymbolicComponent):
+class AntennaMount(NoisyComponent):
     """True misalignment of the antenna: drawn at the start, then a random walk."""
 
     default_rate = Rate(hz=100)
@@ -33,7 +33,7 @@ class AntennaMount(SymbolicComponent):
         return antenna_mount_model()
 
 
-class SyntheticSarFix(SymbolicComponent):
+class SyntheticSarFix(NoisyComponent):
     """A SAR fix without an image: where the boresight meets the ellipsoid, with given errors.
 
     No fix appears where the boresight misses the Earth.

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from terrafix.components.fields import XYZ
+from terrafix.components.noisy import NoisyComponent
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import Input, Output
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
 from terrafix.models.geometry.earth import EARTH
-from terrafix.models.motion.attitude import VELOCITIES, attitude_sensor_model, lvlh_attitude_model
+from terrafix.models.motion.attitude import (
+    VELOCITIES,
+    attitude_sensor_model,
+    level_is_defined,
+    lvlh_attitude_model,
+)
 
 
 class LvlhAttitude(SymbolicComponent):
@@ -35,12 +44,25 @@ class LvlhAttitude(SymbolicComponent):
         (3,), unit="rad", frame="b", labels=XYZ, doc="rotation increment relative to inertial space"
     )
 
+    def fail(self, mask: ArrayLike, reason: str) -> None:
+        """Exclude members, with what the geometry says is the reason."""
+        mask = np.asarray(mask, np.bool_)
+        r, u = self.r_e, self.v_e
+        known = mask & np.isfinite(r).all(axis=1) & np.isfinite(u).all(axis=1)
+        if self.velocity == "inertial":
+            u = u + np.cross([0.0, 0.0, 1.0], r) * self.rotation_rate[:, None]
+        level = level_is_defined(r, u)
+        turned = known & level & (self.step_index > 0)
+        super().fail(known & ~level, "level axes are undefined: the velocity is zero or vertical")
+        super().fail(turned, "it turned by half a turn in a step: its sign and rate are undefined")
+        super().fail(mask & ~(known & ~level) & ~turned, reason)
+
     def build_model(self) -> Model:
         """Build the model for the chosen velocity."""
         return lvlh_attitude_model(self.velocity)
 
 
-class AttitudeSensor(SymbolicComponent):
+class AttitudeSensor(NoisyComponent):
     """Attitude determination system: the true attitude with white noise and a constant bias."""
 
     default_rate = Rate(hz=100)

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from terrafix.components.fields import XYZ
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import Output
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.motion.gravity import GRAVITY_MODELS
-from terrafix.models.motion.orbit import orbit_model
+from terrafix.models.motion.orbit import below_surface, orbit_model
+
+_NEAR = 1.001
+"""Where an orbit that is not finite a step later has come to the surface, in radii."""
 
 
 class OrbitTruth(SymbolicComponent):
-    """Satellite under gravity and drag, integrated by fourth-order Runge-Kutta steps."""
+    """Satellite under gravity and drag, integrated by fourth-order Runge-Kutta steps.
+
+    A member that comes to the surface of the Earth fails.
+    """
 
     default_rate = Rate(hz=100)
 
@@ -39,6 +49,31 @@ class OrbitTruth(SymbolicComponent):
     delta_v_e = Output(
         (3,), unit="m/s", frame="e", labels=XYZ, doc="non-gravitational increment of the last step"
     )
+
+    def validate(self) -> None:
+        """Look whether it starts outside the Earth."""
+        super().validate()
+        r0_i, radius = self.setting("r0_i"), float(self.setting("radius"))
+        if below_surface(r0_i, radius):
+            raise ConfigurationError(
+                f"'{self.name}.r0_i' lies inside the Earth: {np.linalg.norm(r0_i):.6g} m from its "
+                f"center, of a radius of {radius:.6g} m\n"
+                "  a bare number is in meters; write a unit with it: "
+                f'{self.name}.r0_i = "[7070, 0, 0] km"'
+            )
+
+    def fail(self, mask: ArrayLike, reason: str) -> None:
+        """Exclude members; where an orbit has come to the Earth, that is the reason."""
+        mask = np.asarray(mask, np.bool_)
+        # results that are not finite are not kept: those of the step before lie above
+        if self.step_index:
+            r = self._states["r_i"] + self._states["v_i"] * self._dt[0]
+        else:
+            r = self.r0_i
+        with np.errstate(over="ignore"):
+            down = mask & below_surface(r.T, self.radius * _NEAR)
+        super().fail(down, "the orbit is inside the Earth")
+        super().fail(mask & ~down, reason)
 
     def build_model(self) -> Model:
         """Build the model for the chosen gravity and drag."""

@@ -28,6 +28,9 @@ from terrafix.models.motion.ephemeris import Ephemeris, read_eof
 CLOSE = 1e-9  # [s] within which two times are the same: far below any step, far above rounding
 
 
+_UNCOVERED = "the orbit file does not cover this time"
+
+
 class Recording:
     """Recorded outputs of one component of an earlier run.
 
@@ -237,6 +240,10 @@ class RecordedOrbit(Component):
         """Read the file."""
         super().bind(environment)
         self._orbit = self._read()
+        if isinstance(self._orbit, Recording):
+            self._orbit.choose(environment.members)
+
+    def _initialize_impl(self) -> None:
         own = (self.start, self.earth_angle0, self.rotation_rate)
         alike = all(np.ptp(p) == 0.0 for p in own)
         if isinstance(self._orbit, Recording):
@@ -245,12 +252,9 @@ class RecordedOrbit(Component):
                     f"'{self.name}.start' differs between members: a recording is played for all "
                     "from one time\n  disperse it with an orbit file, which is interpolated"
                 )
-            self._orbit.choose(environment.members)
             alike = alike and len(self._orbit.members) == 1
         # compute once for all members unless they differ
         self._who = slice(0, 1) if alike else slice(None)
-
-    def _initialize_impl(self) -> None:
         self._publish(0.0)
 
     def _step_impl(self, t: float, dt: float) -> None:
@@ -262,7 +266,11 @@ class RecordedOrbit(Component):
             self._orbit.publish(float(self.start[0]) + t)
             held = self._orbit.samples
         else:
-            self.r_e, self.v_e = self._orbit.at(self.start[self._who] + t)
+            wanted, known = self.start[self._who] + t, self._orbit.t
+            outside = (wanted < known[0]) | (wanted > known[-1])
+            if outside.any():
+                self.fail(np.broadcast_to(outside, self.n_members), _UNCOVERED)
+            self.r_e, self.v_e = self._orbit.at(np.clip(wanted, known[0], known[-1]))
         if "r_i" not in held or "v_i" not in held:
             rate = self.rotation_rate[self._who]
             angle = self.earth_angle0[self._who] + rate * t

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from terrafix.components.fields import GRID, HEIGHT, SURFACE
+from terrafix.components.shared import require_common, shared_setting
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -12,9 +15,10 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import SharedOutput
 from terrafix.models.core.arrays import Single
-from terrafix.models.maps.dem import Dem, flat_dem, read_dem, read_jacksboro
+from terrafix.models.maps.dem import HIGHEST, LOWEST, Dem, flat_dem, read_dem, read_jacksboro
 from terrafix.models.radar.scene import Scene
 
+_log = logging.getLogger(__name__)
 SOURCES = ("file", "jacksboro", "flat")
 
 
@@ -32,9 +36,11 @@ class Terrain(Component):
         doc="file; jacksboro: the real one that comes with matplotlib; flat: one height",
     )
     dem_file = OptionalFilePath(doc="tile of SRTM (.hgt) or arrays (.npz)")
-    flat_height = Parameter(0.0, unit="m", doc="height everywhere (flat); 0 is the sea")
+    flat_height = Parameter(
+        0.0, unit="m", minimum=LOWEST, maximum=HIGHEST, doc="height everywhere (flat); 0 is the sea"
+    )
     mirrored = Flag(False, doc="go on for ever in mirror images: artificial, without borders")
-    fill_voids = Flag(False, doc="interpolate voids instead of refusing them")
+    fill_voids = Flag(False, doc="interpolate voids, and say so, instead of refusing them")
     surface_seed = Count(0, doc="of texture and bright points")
     parcels = Parameter(2.5, minimum=0.0, doc="texture with sharp borders, standard deviation [dB]")
     smooth = Parameter(1.5, minimum=0.0, doc="smooth texture, standard deviation [dB]")
@@ -53,7 +59,7 @@ class Terrain(Component):
     def _read(self) -> Dem:
         source, path = self.setting("source"), self.setting("dem_file")
         if source == "flat":
-            return flat_dem(float(self.setting("flat_height")))
+            return flat_dem(float(shared_setting(self, "flat_height")))
         if source == "file" and path is None:
             raise ConfigurationError(
                 f"'{self.name}' needs an elevation model\n"
@@ -61,7 +67,8 @@ class Terrain(Component):
             )
         try:
             dem = read_jacksboro() if source == "jacksboro" else read_dem(path)
-            dem = dem.filled() if self.setting("fill_voids") else dem
+            self._n_filled = dem.n_void if self.setting("fill_voids") else 0
+            dem = dem.filled() if self._n_filled else dem
         except (OSError, ValueError) as error:
             raise ConfigurationError(
                 f"'{self.name}' cannot read its elevation model: {error}\n"
@@ -75,7 +82,13 @@ class Terrain(Component):
         return dem.tiled() if self.setting("mirrored") else dem
 
     def _initialize_impl(self) -> None:
+        require_common(self)
         dem = self._read()
+        if self._n_filled:
+            _log.warning(
+                "'%s' filled %d void points of the %d of '%s' by interpolation from their rims",
+                *(self.name, self._n_filled, dem.height.size, dem.name),
+            )
         self.height = dem.height
         self.grid = np.array(
             [
@@ -93,8 +106,6 @@ class Terrain(Component):
             self.point_density,
             self.point_brightness,
         )
-        if any(np.ptp(s) for s in strengths):
-            raise ConfigurationError(f"the surface of '{self.name}' differs between members")
         self.surface = np.array([float(self.surface_seed), *(float(s[0]) for s in strengths)])
 
     def _step_impl(self, t: float, dt: float) -> None:

@@ -17,8 +17,8 @@ derivatives; inputs, parameters and noise are held.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -141,6 +141,24 @@ class Model:
                             f"model '{self.name}': {kind}['{key}'] depends on '{element}', which "
                             "is not declared as an input, state, parameter, noise, step or time"
                         )
+
+    def without_noise_of(self, zero: Collection[str]) -> Model:
+        """Make the same model without the noise that parameters of value zero cancel.
+
+        The parameters in `zero` are zero in its expressions, though still declared.
+        """
+        gone = [self.parameters[k] for k in zero]
+        kinds = {}
+        for kind in ("outputs", "next", "derivatives", "initial"):
+            expressions = [ca.SX(e) for e in getattr(self, kind).values()]
+            if expressions:
+                expressions = ca.substitute(
+                    expressions, gone, [ca.SX.zeros(*p.shape) for p in gone]
+                )
+            kinds[kind] = dict(zip(getattr(self, kind), expressions, strict=True))
+        left = ca.veccat(*(e for group in kinds.values() for e in group.values()))
+        noise = {k: s for k, s in self.noise.items() if ca.depends_on(left, s)}
+        return replace(self, noise=noise, **kinds)
 
     def _symbol_groups(self) -> list[dict[str, Any]]:
         clock = {k: s for k, s in (("step", self.step), ("time", self.time)) if s is not None}

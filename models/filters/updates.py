@@ -10,6 +10,9 @@ pixel's position; and underweighting by a factor :math:`\beta`, Lear's device,
 which enlarges the gain's covariance and the posterior's, not the one by which the innovation is
 judged.
 
+A measurement says which of its elements are angles: a bearing of 3.1 rad that was predicted as
+-3.1 rad is off by 0.08 rad, not by 6.2.
+
 References
 ----------
 .. [1] B. S. Pogorelsky, R. Zanetti, J. Chen, S. Jenkins, "Synthetic Aperture Radar Based
@@ -25,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import pi
 from typing import Any
 
 import casadi as ca
@@ -58,6 +62,8 @@ class Measurement:
         Covariance (m, m) of the noise at an error.
     present : SX, shape (m, 1)
         1 where an element was measured, else 0.
+    angles : tuple of int
+        Elements that are angles [rad]: their differences are taken within half a turn.
     """
 
     y: Any
@@ -65,10 +71,25 @@ class Measurement:
     jacobian: Callable[[Any], Any]
     noise: Callable[[Any], Any]
     present: Any
+    angles: tuple[int, ...] = ()
 
     def residual(self, error: Any) -> Any:
         """Measured minus predicted, (m, 1); zero where absent."""
-        return self.masked(self.y - self.predict(error))
+        return self.masked(self.wrapped(self.y - self.predict(error)))
+
+    def wrapped(self, difference: Any) -> Any:
+        """Difference of two measurements (m, 1), its angles within half a turn."""
+        out = ca.SX(difference)
+        for k in self.angles:
+            out[k] -= 2 * pi * ca.floor((out[k] + pi) / (2 * pi))
+        return out
+
+    def continued(self, values: Any, center: Any) -> Any:
+        """A measurement (m, 1), its angles within half a turn of those of another."""
+        out = ca.SX(values)
+        for k in self.angles:
+            out[k] = center[k] + self.wrapped(values - center)[k]
+        return out
 
     def sensitivity(self, error: Any) -> Any:
         """Jacobian (m, n) with rows of zeros where absent."""
@@ -213,16 +234,22 @@ def unscented_update(P: Any, measurement: Measurement, beta: Any) -> Update:
     n = P.shape[0]
     root = semidefinite_root(P)
     points = [ca.sqrt(n) * root[:, j] for j in range(n)]
-    ahead = [measurement.masked(measurement.predict(p)) for p in points]
-    behind = [measurement.masked(measurement.predict(-p)) for p in points]
+    zero = ca.SX.zeros(n)
+    center = measurement.predict(zero)
+
+    def predicted_at(error: Any) -> Any:
+        return measurement.masked(measurement.continued(measurement.predict(error), center))
+
+    ahead = [predicted_at(p) for p in points]
+    behind = [predicted_at(-p) for p in points]
     sums = ca.horzcat(*((a + b) / 2 for a, b in zip(ahead, behind, strict=True)))
     M = ca.horzcat(*((a - b) / 2 for a, b in zip(ahead, behind, strict=True))) / ca.sqrt(n)
     predicted = ca.sum2(sums) / n
     spread = (sums - ca.repmat(predicted, 1, n)) / ca.sqrt(n)
     second = mirrored(ca.mtimes(spread, spread.T))
     P_yy = mirrored(ca.mtimes(M, M.T)) + second
-    zero = ca.SX.zeros(n)
-    residual, R = measurement.masked(measurement.y - predicted), measurement.covariance(zero)
+    residual = measurement.masked(measurement.wrapped(measurement.y - predicted))
+    R = measurement.covariance(zero)
     S = P_yy + R
     nis, positive = _judged(residual, S)
     K, solvable = _gain(ca.mtimes(root, M.T), S + beta * P_yy)

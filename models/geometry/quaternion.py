@@ -32,6 +32,7 @@ References
 
 from __future__ import annotations
 
+from math import nan
 from typing import Any
 
 import casadi as ca
@@ -46,6 +47,9 @@ IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 _SMALL = 1e-4
 """Squared angle [rad^2] below which series replace quotients; their error is below 1e-17."""
+
+_LEAST_COSINE = (4 * 1e-6) ** 2
+"""Squared, of half the turn between quaternions, times four: below, rounding decides."""
 
 
 def product(p: Any, q: Any) -> Any:
@@ -153,10 +157,11 @@ def from_matrix(matrix: Any) -> Any:
 def from_matrix_near(matrix: Any, reference: Any) -> Any:
     r"""Quaternion (4,) of a transformation matrix with the sign nearer a reference (4,).
 
-    Since :math:`4 q q^T q_{ref} = 4 q (q \cdot q_{ref})`, one product gives value and sign. Not
-    defined half a turn away from the reference.
+    Since :math:`4 q q^T q_{ref} = 4 q (q \cdot q_{ref})`, one product gives value and sign. Half a
+    turn away from the reference, to some microradians, it is not defined, and not a number.
     """
-    return normalized(ca.mtimes(outer_of_matrix(matrix), reference))
+    near = ca.mtimes(outer_of_matrix(matrix), reference)
+    return normalized(near) * ca.if_else(ca.dot(near, near) > _LEAST_COSINE, 1.0, nan)
 
 
 product_array = over_members(product, (4,), (4,))

@@ -23,6 +23,9 @@ from terrafix.models.radar.multilook import detected, full_index, multilook_inde
 from terrafix.models.radar.scene import Scene
 
 KEYS = ("amplitude", "rows", "columns", "latitude_deg", "longitude_deg", "height_m")
+_TURN = 2 * np.pi
+_WIDEST = float(np.radians(30.0))
+"""Largest change of longitude between tie points: beyond, they are about a pole [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +38,14 @@ class Reference:
     rows, columns : ndarray, shape (n_i,) and (n_j,)
         Rows and columns of the tie points, fractional, increasing.
     latitude, longitude, height : ndarray, shape (n_i, n_j)
-        Places of the tie points: [rad], [rad], and [m] above the ellipsoid.
+        Places of the tie points: [rad], [rad], and [m] above the ellipsoid. Longitudes are kept
+        within half a turn of the middle one, so that they go on across 180 degrees.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, or something is not finite.
+        If shapes do not fit, something is not finite, a latitude is beyond a pole, or the image
+        lies about one, where longitude cannot be interpolated.
     """
 
     amplitude: Single
@@ -69,6 +74,17 @@ class Reference:
         for name in ("rows", "columns"):
             if not (np.diff(getattr(self, name)) > 0).all():
                 raise ValueError(f"{name} of the tie points of a reference do not increase")
+        if np.abs(self.latitude).max() > np.pi / 2:
+            raise ValueError("latitude of a reference is beyond a pole: is it in degrees?")
+        middle = self.longitude[ties[0] // 2, ties[1] // 2]
+        longitude = self.longitude - _TURN * np.rint((self.longitude - middle) / _TURN)
+        object.__setattr__(self, "longitude", longitude)
+        steps = [np.abs(np.diff(longitude, axis=axis)).max() for axis in (0, 1)]
+        if max(steps) > _WIDEST:
+            raise ValueError(
+                f"a reference lies about a pole: the longitude of its tie points changes by "
+                f"{np.degrees(max(steps)):.0f} deg from one to the next"
+            )
 
     def place(self, row: ArrayLike, column: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Latitude, longitude [rad] and height [m] of pixels, fractional, shape (...).
@@ -91,6 +107,12 @@ class Reference:
             interpolated(self.longitude),
             interpolated(self.height),
         )
+
+    def own_turn(self, longitude: ArrayLike) -> FloatArray:
+        """The same longitudes [rad], within half a turn of the middle of the reference."""
+        middle = (self.longitude.min() + self.longitude.max()) / 2
+        longitude = np.asarray(longitude, np.float64)
+        return np.asarray(longitude - _TURN * np.rint((longitude - middle) / _TURN))
 
     def described(self) -> str:
         """What it covers, for messages."""

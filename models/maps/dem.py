@@ -22,7 +22,11 @@ KEYS = ("height_m", "latitude0_deg", "longitude0_deg", "latitude_step_deg", "lon
 JACKSBORO = "jacksboro"
 """Name of the elevation model that comes with matplotlib: 36.3 N, 84.25 W, of SRTM."""
 
-_VOID = -32768
+VOIDS = (-32768.0, -32767.0, -9999.0)
+"""What files write where no height is known: SRTM, DTED, and most others."""
+LOWEST, HIGHEST = -12_000.0, 9_000.0
+"""Bounds of the Earth's heights and depths [m]: the Challenger Deep and Everest lie within."""
+
 _SIZES = {1201 * 1201 * 2: 1201, 3601 * 3601 * 2: 3601}
 
 
@@ -98,6 +102,7 @@ class Dem:
             ahead, behind = (self.at(latitude + s * north, longitude) for s in (1, -1))
             right, left = (self.at(latitude, longitude + s * east) for s in (1, -1))
             return (ahead - behind) / (2 * meridian), (right - left) / (2 * parallel)
+        longitude = longitude - 2 * np.pi * self._turns(longitude)
         lat1, lat0 = (np.clip(latitude + s * north, *self._span(0)) for s in (1, -1))
         lon1, lon0 = (np.clip(longitude + s * east, *self._span(1)) for s in (1, -1))
         rise_n = self.at(lat1, longitude) - self.at(lat0, longitude)
@@ -172,9 +177,14 @@ class Dem:
         y = (np.asarray(latitude, np.float64) - self.latitude0) / self.latitude_step
         middle = sum(self._span(1)) / 2
         turn = np.asarray(longitude, np.float64) - middle
-        turn = turn - 2 * np.pi * np.rint(turn / (2 * np.pi))
+        turn = turn - 2 * np.pi * self._turns(longitude)
         x = (turn + middle - self.longitude0) / self.longitude_step
         return y, x
+
+    def _turns(self, longitude: ArrayLike) -> FloatArray:
+        """Whole turns from the middle of the model to longitudes [rad]."""
+        middle = sum(self._span(1)) / 2
+        return np.asarray(np.rint((np.asarray(longitude, np.float64) - middle) / (2 * np.pi)))
 
     def _cell(self, latitude: ArrayLike, longitude: ArrayLike) -> tuple[np.ndarray, ...]:
         """Row and column of the cell's southwestern corner, and the place within it."""
@@ -205,8 +215,23 @@ def flat_dem(height: float = 0.0) -> Dem:
     return Dem(grid, 0.0, 0.0, 1.0, 1.0, "a flat elevation model", mirrored=True)
 
 
+def _heights(raw: NDArray[Any], path: Path) -> Single:
+    """Heights as a file holds them, voids as NaN; what the Earth does not have is refused."""
+    height = np.array(raw, np.float32)
+    height[np.isin(height, np.array(VOIDS, np.float32))] = np.nan
+    wrong = (height < LOWEST) | (height > HIGHEST)
+    if wrong.any():
+        i, j = (int(k) for k in np.argwhere(wrong)[0])
+        raise ValueError(
+            f"'{path}': {int(wrong.sum())} of its {height.size} heights are beyond {LOWEST:.0f} to "
+            f"{HIGHEST:.0f} m, the first is {height[i, j]:g} m in row {i}, column {j}\n"
+            "  heights are in meters; write NaN where none is known"
+        )
+    return height
+
+
 def read_hgt(path: Path) -> Dem:
-    """Read a tile of SRTM (.hgt): big-endian 16-bit, 1201 or 3601 square, -32768 where void.
+    """Read a tile of SRTM (.hgt): big-endian 16-bit, 1201 or 3601 square, `VOIDS` where void.
 
     The name (N44W072) gives its southwestern corner; its first row is the northernmost.
 
@@ -229,7 +254,7 @@ def read_hgt(path: Path) -> Dem:
         )
     n = _SIZES[size]
     raw = np.fromfile(path, ">i2").reshape(n, n)[::-1]
-    height = np.where(raw == _VOID, np.nan, raw).astype(np.float32)
+    height = _heights(raw, path)
     ns, lat, ew, lon = found.groups()
     south = int(lat) * (1 if ns == "N" else -1)
     west = int(lon) * (1 if ew == "E" else -1)
@@ -281,7 +306,7 @@ def read_dem(path: Path) -> Dem:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If it cannot be read.
+        If it cannot be read, or holds what is no height of the Earth.
     """
     if path.suffix.lower() == ".hgt":
         return read_hgt(path)
@@ -290,6 +315,7 @@ def read_dem(path: Path) -> Dem:
     arrays = read_arrays(path, KEYS, "an elevation model")
     try:
         south, west, north, east = (float(np.radians(float(arrays[k]))) for k in KEYS[1:])
-        return Dem(np.asarray(arrays["height_m"], np.float32), south, west, north, east, path.name)
+        return Dem(_heights(arrays["height_m"], path), south, west, north, east, path.name)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"'{path}': {error}") from error
+        told = str(error)
+        raise ValueError(told if str(path) in told else f"'{path}': {told}") from error

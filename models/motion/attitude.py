@@ -7,6 +7,8 @@ Body axes: z to the center of the Earth, y to the right (against the orbit norma
     \hat y = -\frac{r \times u}{\lVert r \times u \rVert}, \qquad
     \hat x = \hat y \times \hat z.
 
+It is undefined, and not a number, where u is zero or within a microradian of r.
+
 With :math:`u` the Earth-fixed velocity the body is steered in yaw, and a side-looking antenna has
 zero squint and a Doppler centroid near zero; with the inertial velocity it is up to 4 degrees off
 (for an L-band radar in a polar orbit, a centroid of 2 kHz instead of 54 Hz).
@@ -14,9 +16,12 @@ zero squint and a Doppler centroid near zero; with the inertial velocity it is u
 
 from __future__ import annotations
 
+from math import nan
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.batch import over_members
 from terrafix.models.core.model import Model
@@ -30,6 +35,9 @@ from terrafix.models.geometry.quaternion import (
     rotation_vector,
 )
 
+_LEAST_SINE = 1e-6
+"""Of the angle between position and velocity: below, rounding decides where "right" is."""
+
 VELOCITIES = ("earth-fixed", "inertial")
 """Names of the velocity that the x axis follows."""
 
@@ -38,8 +46,18 @@ def lvlh_matrix(r: Any, u: Any) -> Any:
     """Build the transformation (3, 3) to level body axes from those of r and u, (3,) each."""
     z = -r / ca.sqrt(ca.dot(r, r))
     normal = ca.cross(u, r)
-    y = normal / ca.sqrt(ca.dot(normal, normal))
+    squared = ca.dot(normal, normal)
+    defined = squared > _LEAST_SINE**2 * ca.dot(u, u) * ca.dot(r, r)
+    y = normal / ca.sqrt(squared) * ca.if_else(defined, 1.0, nan)
     return ca.horzcat(ca.cross(y, z), y, z).T
+
+
+def level_is_defined(r: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:
+    """Whether a position and the velocity that is followed, (..., 3) each, have level axes."""
+    normal = np.linalg.norm(np.cross(u, r), axis=-1)
+    return np.asarray(
+        normal > _LEAST_SINE * np.linalg.norm(u, axis=-1) * np.linalg.norm(r, axis=-1)
+    )
 
 
 def lvlh_quaternion(r: Any, u: Any) -> Any:
@@ -68,7 +86,8 @@ def lvlh_attitude_model(velocity: str = "earth-fixed") -> Model:
     -------
     Model
         Inputs ``r_e`` [m], ``v_e`` [m/s] and ``delta_v_e`` [m/s], (3,) each; parameter
-        ``rotation_rate`` [rad/s]. Outputs ``q_be`` (4,), continuous in sign; ``delta_v_b`` (3,)
+        ``rotation_rate`` [rad/s]. Outputs ``q_be`` (4,), continuous in sign, not a number half a
+        turn from the last; ``delta_v_b`` (3,)
         [m/s], the non-gravitational velocity increment in the body axes at the step's end, and
         ``delta_theta_b`` (3,) [rad], the rotation relative to inertial space over the step.
 

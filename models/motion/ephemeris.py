@@ -1,5 +1,8 @@
 """Recorded orbits: Sentinel-1 orbit files (.EOF), and the state between their epochs.
 
+Seconds are counted in atomic time (TAI), which every state of such a file is tagged with: between
+two UTC tags lies one more where a leap second was inserted.
+
 Position between two epochs is the cubic that takes position and velocity at both (Hermite); the
 velocity is its derivative. The error of position grows with the fourth power of the spacing: at
 the 10 s of an orbit file it is a fraction of a millimeter in a low Earth orbit.
@@ -15,11 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray
+from terrafix.models.geometry.earth import EARTH
 
 MAX_BYTES = 64 * 1024 * 1024
 """Largest orbit file read; a day of state vectors every 10 s takes 5 MB."""
 
-_FIELDS = ("X", "Y", "Z", "VX", "VY", "VZ")
+_FIELDS = {"X": "m", "Y": "m", "Z": "m", "VX": "m/s", "VY": "m/s", "VZ": "m/s"}
+_LEAP = ":60"
+"""How the tag of a leap second ends, before its fraction."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +35,7 @@ class Ephemeris:
     Parameters
     ----------
     utc : ndarray of datetime64[ns], shape (n_epochs,)
-        Epochs, UTC.
+        Epochs, UTC; within a leap second, the tag of the second after it.
     t : ndarray, shape (n_epochs,)
         Epochs in seconds since the first.
     r_e : ndarray, shape (n_epochs, 3)
@@ -132,10 +138,29 @@ def read_eof(path: str | Path) -> Ephemeris:
         raise ValueError(
             f"{path}: holds {len(vectors)} state vectors but declares {declared or 'no count'}"
         )
-    utc = np.array([_epoch(path, i, osv) for i, osv in enumerate(vectors)], "datetime64[ns]")
+    utc = _epochs(path, vectors, "UTC")
+    atomic = [osv.find("TAI") is not None for osv in vectors]
+    if any(atomic):
+        t = _seconds(_epochs(path, vectors, "TAI"))
+        leaps = t - _seconds(utc)
+        if np.any(leaps != np.round(leaps)) or np.any(np.diff(leaps) < 0):
+            k = int(np.argmax((leaps != np.round(leaps)) | (np.diff(leaps, prepend=0.0) < 0)))
+            raise ValueError(
+                f"{path}: TAI and UTC of state vector {k} do not differ as those of the first, by "
+                "whole seconds"
+            )
+    else:
+        t = _seconds(utc)
+        _refuse_leap_seconds(path, utc)
     states = np.array([_state(path, i, osv) for i, osv in enumerate(vectors)], np.float64)
     states = states.reshape(-1, 6)
-    t = (utc - utc[:1]).astype(np.int64) / 1e9
+    distance = np.linalg.norm(states[:, :3], axis=1)
+    if np.any(distance < EARTH.polar_radius):
+        k = int(np.argmin(distance))
+        raise ValueError(
+            f"{path}: state vector {k} lies inside the Earth, {distance[k]:.6g} m from its center; "
+            "positions are in meters"
+        )
     try:
         return Ephemeris(utc, t, states[:, :3].copy(), states[:, 3:].copy())
     except ValueError as error:
@@ -157,10 +182,33 @@ def _text(path: Path, index: int, osv: ET.Element, tag: str) -> str:
     return text.strip()
 
 
-def _epoch(path: Path, index: int, osv: ET.Element) -> np.datetime64:
-    text = _text(path, index, osv, "UTC")
+def _seconds(epochs: NDArray[np.datetime64]) -> FloatArray:
+    return np.asarray((epochs - epochs[:1]).astype(np.int64) / 1e9)
+
+
+def _refuse_leap_seconds(path: Path, utc: NDArray[np.datetime64]) -> None:
+    """Raise ValueError where UTC tags span the end of a half-year, when leap seconds come."""
+    for day in np.unique(utc.astype("datetime64[D]"))[1:]:
+        if str(day)[5:] in ("01-01", "07-01"):
+            raise ValueError(
+                f"{path}: spans the start of {day}, where a leap second may lie, and has no TAI\n"
+                "  give every state its TAI, as orbit files do"
+            )
+
+
+def _epochs(path: Path, vectors: list[ET.Element], scale: str) -> NDArray[np.datetime64]:
+    """Tags of all states in a time scale, "UTC" or "TAI"."""
+    epochs = [_epoch(path, i, osv, scale) for i, osv in enumerate(vectors)]
+    return np.array(epochs, "datetime64[ns]")
+
+
+def _epoch(path: Path, index: int, osv: ET.Element, scale: str) -> np.datetime64:
+    text = _text(path, index, osv, scale)
+    written, whole = text.removeprefix(f"{scale}="), np.timedelta64(0, "s")
+    if scale == "UTC" and written[16:19] == _LEAP:
+        written, whole = f"{written[:16]}:59{written[19:]}", np.timedelta64(1, "s")
     try:
-        epoch = np.datetime64(text.removeprefix("UTC="), "ns")
+        epoch = np.datetime64(written, "ns") + whole
     except ValueError as error:
         raise ValueError(f"{path}: state vector {index} has the epoch '{text}'") from error
     if np.isnat(epoch):
@@ -170,8 +218,12 @@ def _epoch(path: Path, index: int, osv: ET.Element) -> np.datetime64:
 
 def _state(path: Path, index: int, osv: ET.Element) -> list[float]:
     values = []
-    for tag in _FIELDS:
+    for tag, unit in _FIELDS.items():
         text = _text(path, index, osv, tag)
+        found = osv.find(tag)
+        given = unit if found is None else found.get("unit", unit)
+        if given != unit:
+            raise ValueError(f"{path}: state vector {index} has {tag} in '{given}', not '{unit}'")
         try:
             values.append(float(text))
         except ValueError as error:

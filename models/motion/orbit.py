@@ -10,11 +10,13 @@ classical Runge-Kutta method of order four.
 
 from __future__ import annotations
 
+from math import nan
 from typing import Any
 
 import casadi as ca
 
 from terrafix.models.core.model import Model
+from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import (
     earth_angle,
     earth_fixed_from_inertial,
@@ -23,14 +25,19 @@ from terrafix.models.geometry.frames import (
 from terrafix.models.motion.gravity import drag_acceleration, gravity_acceleration
 
 
+def below_surface(r: Any, radius: Any) -> Any:
+    """Whether a position (3,) [m] lies inside an ellipsoid of the Earth's flattening."""
+    z = r[2] * (1 / (1 - EARTH.flattening))
+    return r[0] * r[0] + r[1] * r[1] + z * z < radius * radius
+
+
 def orbit_model(gravity: str = "j2", *, drag: bool = False) -> Model:
     """Satellite under gravity and, if wanted, drag of an atmosphere of given density.
 
     Parameters
     ----------
     gravity : {"j2", "two-body"}
-        Gravity field. The parameters are the same for both; two-body leaves ``radius`` and
-        ``j2`` unused.
+        Gravity field. The parameters are the same for both; two-body leaves ``j2`` unused.
     drag : bool
         Add drag, with the parameters ``density`` [kg/m^3] and ``ballistic_coefficient``, drag
         coefficient times area over mass [m^2/kg].
@@ -42,7 +49,8 @@ def orbit_model(gravity: str = "j2", *, drag: bool = False) -> Model:
         ``radius`` [m], ``j2``, ``rotation_rate`` [rad/s], and ``earth_angle0`` [rad], the angle
         from the inertial to the Earth-fixed x axis at time zero. Outputs ``r_i``, ``v_i``,
         ``r_e``, ``v_e``, (3,) each, and ``delta_v_e`` (3,) [m/s], the non-gravitational velocity
-        increment over the last step in the Earth-fixed axes at its end.
+        increment over the last step in the Earth-fixed axes at its end. Below the surface, the
+        ellipsoid of ``radius`` and the Earth's flattening, ``r_e`` is not a number.
 
     Raises
     ------
@@ -76,6 +84,7 @@ def orbit_model(gravity: str = "j2", *, drag: bool = False) -> Model:
         following = {"sensed_v_before_i": sensed}
         delta_v_e = rotate_about_pole(angle, sensed - sensed_before)
     r_e, v_e = earth_fixed_from_inertial(r, v, angle, rate)
+    r_e *= 1 + ca.if_else(below_surface(r, radius), nan, 0.0)
     return Model(
         "orbit",
         states=states,

@@ -74,8 +74,10 @@ def boresight_on_terrain(
     Raises
     ------
     ValueError
-        If the boresight misses the Earth, or the terrain is not known where it meets it.
+        If the boresight misses the Earth or looks to the left, or the terrain is not known where
+        it meets it.
     """
+    right = np.cross(v_e, r_e)
     direction = boresight_direction_array(q_be, nominal_antenna_array(look, squint), q_mu)
     height = 0.0
     for _ in range(_ROUNDS):
@@ -88,5 +90,10 @@ def boresight_on_terrain(
             break
         height += 0.7 * rise
     line = point - r_e
+    if not line @ right > 0:
+        raise ValueError(
+            "it looks to the left of the track, and images are of the right alone\n"
+            "  set a positive look angle"
+        )
     distance = float(np.linalg.norm(line))
     return Boresight(point, distance, float(v_e @ line) / distance)

@@ -29,6 +29,10 @@ from terrafix.models.maps.dem import Dem
 CELL = float(np.radians(1e-4))
 """Spacing of the texture in latitude and longitude [rad], some 11 m."""
 
+_TURN = 3_600_000
+"""Cells around the Earth."""
+_MOST_CELLS = 32_000
+"""Cells along a side of an image that is resampled: OpenCV counts them in 16 bits."""
 _BLOCK = 512
 _REFERENCE_INCIDENCE = np.radians(38.7)
 _COARSE = 32
@@ -72,8 +76,25 @@ class Scene:
     def texture(self, rows: range, columns: range) -> Single:
         """Texture [dB] of cells, shape (len(rows), len(columns)).
 
-        Cell (i, j) is centered at latitude i and longitude j times `CELL`.
+        Cell (i, j) is centered at latitude i and longitude j times `CELL`; a turn on is the same.
+
+        Raises
+        ------
+        ValueError
+            If there are too many cells for a side of an image, as next to a pole.
         """
+        longest = max(len(rows), len(columns))
+        if longest > _MOST_CELLS:
+            raise ValueError(
+                f"the scene about latitude {np.degrees(rows.start * CELL):.2f} deg takes "
+                f"{longest} cells of its texture along one side, {_MOST_CELLS} at most\n"
+                "  its grid is one of latitude and longitude: fly farther from the pole, or "
+                "receive fewer lines and cells"
+            )
+        parts = [self._texture(rows, part) for part, _ in _within_a_turn(columns)]
+        return parts[0] if len(parts) == 1 else np.hstack(parts)
+
+    def _texture(self, rows: range, columns: range) -> Single:
         fine = _smoothed_noise(self.seed, "fine", rows, columns, _FINE)
         fine *= np.float32(self.fine_db)
         # whole coarse cells that cover the rectangle
@@ -110,6 +131,11 @@ class Scene:
         phase : ndarray, shape (n,)
             Of the reflection [cycles].
         """
+        found = [self._points(rows, part, turn) for part, turn in _within_a_turn(columns)]
+        latitude, longitude, amplitude, phase = np.hstack(found)
+        return latitude, longitude, amplitude, phase
+
+    def _points(self, rows: range, columns: range, turn: int) -> FloatArray:
         found = []
         for bi in range(rows.start // _BLOCK, -(-rows.stop // _BLOCK)):
             for bj in range(columns.start // _BLOCK, -(-columns.stop // _BLOCK)):
@@ -122,7 +148,19 @@ class Scene:
                 found.append(np.vstack([place, 10 ** (db / 20), rng.random(n)]))
         i, j, amplitude, phase = np.hstack(found) if found else np.empty((4, 0))
         inside = (i >= rows.start) & (i < rows.stop) & (j >= columns.start) & (j < columns.stop)
-        return i[inside] * CELL, j[inside] * CELL, amplitude[inside], phase[inside]
+        j = j + turn * _TURN
+        return np.stack([i * CELL, j * CELL, amplitude, phase])[:, inside]
+
+
+def _within_a_turn(columns: range) -> list[tuple[range, int]]:
+    """Columns between 180 degrees west and east, in parts, and by how many turns they lie on."""
+    first, last = ((c + _TURN // 2) // _TURN for c in (columns.start, columns.stop - 1))
+    parts = []
+    for turn in range(first, last + 1):
+        west = turn * _TURN - _TURN // 2
+        start, stop = max(columns.start, west), min(columns.stop, west + _TURN)
+        parts.append((range(start - turn * _TURN, stop - turn * _TURN), turn))
+    return parts
 
 
 def brightness(cosine: FloatArray) -> FloatArray:

@@ -8,7 +8,9 @@ For each triad, with :math:`n_1, n_2` standard normal,
 
 For a random walk :math:`\Phi = 1`, :math:`\Delta t_\Phi = \Delta t`; for a Gauss-Markov bias of
 time constant :math:`\tau`, :math:`\Phi = e^{-\Delta t / \tau}` and
-:math:`\Delta t_\Phi = \tfrac{\tau}{2}(1 - \Phi^2)`, both exact at any step.
+:math:`\Delta t_\Phi = \tfrac{\tau}{2}(1 - \Phi^2)`, both exact at any step. It keeps the variance
+:math:`K^2 \tau / 2`; where no drive :math:`K` is given it is that which keeps the variance of the
+start, :math:`K = \sigma_0 \sqrt{2 / \tau}`.
 
 The Allan deviation of the rate is :math:`N / \sqrt{T}` for the white noise and
 :math:`K \sqrt{T / 3}` for the walk at averaging time :math:`T`.
@@ -37,7 +39,7 @@ def imu_model(bias: str = "walk") -> Model:
     ----------
     bias : {"walk", "gauss-markov"}
         Process of both biases; the second adds the parameters ``accel_bias_time`` and
-        ``gyro_bias_time`` [s], positive.
+        ``gyro_bias_time`` [s], positive, and takes a walk of zero as the one that keeps sigma.
 
     Returns
     -------
@@ -78,7 +80,9 @@ def _triad(increment: str, kind: str, walk: str, bias: str, dt: Any) -> dict[str
     if bias == "gauss-markov":
         tau = parameters[f"{kind}_bias_time"] = ca.SX.sym(f"{kind}_bias_time")
         decay = ca.exp(-dt / tau)
-        following = decay * b + bias_walk * ca.sqrt(tau / 2 * (1 - decay * decay)) * drive
+        fresh = ca.sqrt(1 - decay * decay)
+        driven = bias_walk * ca.sqrt(tau / 2)
+        following = decay * b + ca.if_else(bias_walk > 0, driven, sigma0) * fresh * drive
     measured = (1 + scale_factor) * true + b * dt + random_walk * ca.sqrt(dt) * white
     return {
         "inputs": {f"{increment}_true": true},

@@ -180,7 +180,7 @@ def test_a_run_that_fails_is_status_1_and_keeps_its_records(tmp_path):
     out = tmp_path / "run.nc"
     done = terrafix(
         *("run", ORBIT, "--duration", "100", "--out", out, "--json"),
-        *("--set", "orbit.mu=1e308", "--set", "orbit.r0_i=1,0,0"),
+        *("--set", "orbit.mu=1e308"),
     )
     assert done.exit_code == 1
     result = json.loads(done.stdout)

@@ -12,10 +12,12 @@ import pytest
 from terrafix.components.judges.album import ImageAlbum
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.basics.machine import available_memory
+from terrafix.cosim.declare.component import Environment
 from terrafix.cosim.engine.run import RunError, simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
+from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.cosim.system.system import System
 from terrafix.models.images.matching import REASONS
 from terrafix.models.images.reference import Reference, write_reference
@@ -163,6 +165,47 @@ def test_members_with_different_truths_are_refused():
     assert "fly members with one truth" in text
 
 
+SHARED = {
+    "echo": (
+        *("carrier", "prf", "sample_rate", "chirp_rate", "pulse_length", "doppler_bandwidth"),
+        *("look", "squint", "antenna_length", "snr"),
+    ),
+    "terrain": ("flat_height", "parcels", "smooth", "fine", "point_density", "point_brightness"),
+    "reference": ("look", "squint", "displacement", "snr"),
+    "former": ("velocity_step", "migration_step", "band", "exposure"),
+}
+
+
+def test_what_is_one_for_all_members_cannot_be_dispersed():
+    """Said at the start, before anything is computed with it."""
+    system = small()
+    system.nodes["terrain"].source = "flat"
+    members = np.arange(2)
+    for owner, names in SHARED.items():
+        component = system.nodes[owner]
+        for name in names:
+            environment = Environment(owner, 0, members, members >= 0, lambda *_: None, False)
+            component.bind(environment)
+            values = getattr(component, name)
+            values[1] = np.where(values[1] == 0.0, 1e-3, 0.99 * values[1])
+            with pytest.raises(ConfigurationError) as raised:
+                component.initialize()
+            component.release()
+            assert f"'{owner}.{name}' differs between members" in str(raised.value)
+            assert "out of the dispersions, or fly one member at a time" in str(raised.value)
+
+
+def test_a_member_alone_has_the_radar_that_it_was_given():
+    """Not the one of the file: what a dispersion drew is what is published."""
+    system = small()
+    prf = np.array([2160.0, 2100.0])
+    system.disperse(Dispersion("prf", ("echo.prf",), prf, kind="list"))
+    simulation = Simulation(system, members=[1], duration="0.1")
+    simulation.initialize()
+    assert system.nodes["echo"].radar[1] == 2100.0
+    simulation.master.terminate()
+
+
 def test_too_little_memory_is_said_before_it_starts():
     text = failure(lambda: small(("echo.n_lines", "40000000")))
     assert "'echo' needs about" in text
@@ -185,6 +228,13 @@ def test_too_few_lines_for_the_image_are_refused():
 
 def test_lines_shorter_than_a_pulse_are_refused():
     assert "too few are left" in failure(lambda: small(("echo.n_cells", "180")))
+
+
+@pytest.mark.parametrize("owner", ["echo", "reference", "former"])
+def test_a_look_to_the_left_is_refused(owner):
+    text = failure(lambda: small((f"{owner}.look", "-34.3 deg")))
+    assert f"'{owner}.look' is -0.598" in text
+    assert "it must be positive" in text
 
 
 def test_an_impossible_radar_is_refused():

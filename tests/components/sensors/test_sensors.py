@@ -15,6 +15,7 @@ from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import MessageOutput, Output
 from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.cosim.system.system import System
 from terrafix.models.filters.spacecraft import REASONS
 from terrafix.models.geometry.earth import EARTH
@@ -104,12 +105,17 @@ class Shaken(Component):
         self.delta_v_b, self.delta_theta_b = self.force * dt, self.turn * dt
 
 
-def increments(members, duration, **parameters):
+def shaken_imu(**parameters):
     system = System("imu")
     shaken = system.add(Shaken(), "shaken")
     imu = system.add(Imu(rate=SECOND, **parameters), "imu")
     system.connect(shaken["delta_v_b"], imu["delta_v_b_true"])
     system.connect(shaken["delta_theta_b"], imu["delta_theta_b_true"])
+    return system, imu
+
+
+def increments(members, duration, **parameters):
+    system, imu = shaken_imu(**parameters)
     return fly(system, [imu[n] for n in imu.outputs()], members=members, duration=duration).dataset
 
 
@@ -156,6 +162,75 @@ def test_a_wandering_bias_grows_with_the_square_root_of_time():
     assert not bias[0].any()
     assert_sigma(bias[-1], walk * np.sqrt(duration))
     assert_sigma(bias[9], walk * 3.0)
+
+
+def test_a_gauss_markov_bias_keeps_its_sigma_and_forgets():
+    """Variance sigma0^2 at all times, correlation e^(-T / tau): a first-order Markov process.
+
+    (IEEE Std 952-1997, annex B.4.3.) Without a drive it would end at e^-3 of its sigma.
+    """
+    sigma, tau, n = 1e-3, 10.0, 2000
+    found = increments(
+        n,
+        "30",
+        bias="gauss-markov",
+        accel_bias_sigma0=sigma,
+        accel_bias_time=tau,
+        gyro_bias_sigma0=sigma / 10,
+        gyro_bias_time=tau / 2,
+    )
+    for name, own, time in (("accel", sigma, tau), ("gyro", sigma / 10, tau / 2)):
+        bias = found[f"imu.{name}_bias_b"].to_numpy()
+        assert_sigma(bias[0], own)
+        assert_sigma(bias[30], own)
+        # innovation of a first-order process: bias - e^(-T / tau) bias before
+        decay = np.exp(-4 / time)
+        assert_sigma(bias[30] - decay * bias[26], own * np.sqrt(1 - decay**2))
+
+
+def streams(component):
+    return {a.name for a in component._kept[1].noise}
+
+
+def test_an_inertial_sensor_draws_only_what_its_sigmas_let_through():
+    white, drive = {"accel_white", "gyro_white"}, {"accel_bias_noise", "gyro_bias_noise"}
+    for parameters, drawn in (
+        ({}, set()),
+        ({"velocity_random_walk": 1e-3}, {"accel_white"}),
+        ({"angle_random_walk": 1e-3, "gyro_bias_walk": 1e-4}, {"gyro_white", "gyro_bias_noise"}),
+        ({"bias": "gauss-markov", "accel_bias_sigma0": 1e-4}, {"accel_bias_noise"}),
+    ):
+        system, imu = shaken_imu(**parameters)
+        simulate(system, members=2, duration="1")
+        assert streams(imu) == drawn
+        assert set(imu.model.noise) == white | drive  # what an FMU is made of: all of it
+
+
+def test_a_sigma_that_is_zero_for_some_members_alone_is_drawn_for_all():
+    """A member's numbers are those it has when flown alone, with zero as with another sigma."""
+    system, imu = shaken_imu(accel_bias_sigma0=1e-3)
+    system.disperse(
+        Dispersion("grade", ("imu.velocity_random_walk",), np.array([0.0, 2e-3]), kind="list")
+    )
+    system.record("all", [imu[n] for n in imu.outputs()], period="1 s")
+    both = simulate(system, members=2, duration="4").dataset
+    assert "accel_white" in streams(imu)
+    for member, drawn in ((0, set()), (1, {"accel_white"})):
+        alone = simulate(system, members=[member], duration="4").dataset
+        assert streams(imu) & {"accel_white"} == drawn
+        for name in ("imu.delta_v_b", "imu.delta_theta_b", "imu.accel_bias_b"):
+            np.testing.assert_array_equal(alone[name][:, 0], both[name][:, member])
+
+
+def test_a_perfect_attitude_sensor_and_a_fixed_antenna_draw_nothing():
+    system = System("quiet")
+    _, attitude = truth(system)
+    sensor = system.add(AttitudeSensor(rate=SECOND), "sensor")
+    system.connect(attitude["q_be"], sensor["q_be_true"])
+    mount = system.add(AntennaMount(rate=SECOND), "mount")
+    found = fly(system, [attitude["q_be"], sensor["q_be"]], members=2, duration="2").dataset
+    assert streams(sensor) == streams(mount) == set()
+    np.testing.assert_array_equal(found["sensor.q_be"], found["attitude.q_be"])
 
 
 # ------------------------------------------------------------------------- antenna

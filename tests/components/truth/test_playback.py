@@ -13,6 +13,7 @@ import pytest
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.files.readers import read_system
+from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.models.geometry.earth import EARTH
 
 ROOT = Path(__file__).parents[3]
@@ -265,6 +266,32 @@ def test_an_orbit_file_is_interpolated_to_the_orbit_it_holds(tmp_path, eof):
     np.testing.assert_allclose(  # axes coincide at t = 0
         found["orbit.r_i"][0], found["orbit.r_e"][0], atol=1e-9, rtol=0
     )
+
+
+def test_members_that_start_at_other_times_are_at_other_places(tmp_path, eof):
+    """Each on the circle of the file, at its own start; who starts beyond its end fails alone."""
+    system = read_system(orbit_system(tmp_path, eof))
+    starts = np.array([0.0, 100.0, STATES * SPACING])
+    system.disperse(Dispersion("start", ("orbit.start",), starts, kind="list"))
+    result = simulate(system, members=3, duration="5")
+    found = result.dataset["orbit.r_e"]
+    t = found[found.dims[0]].to_numpy()
+    limit = RADIUS * RATE**4 * SPACING**4 / 384
+    for member in (0, 1):
+        r, _ = circle(t + starts[member])
+        np.testing.assert_allclose(found[:, member], r, atol=limit, rtol=0)
+    (failure,) = result.excluded
+    assert (failure["member"], failure["t_s"]) == (2, 0.0)
+    assert failure["reason"] == "the orbit file does not cover this time"
+
+
+def test_members_with_other_angles_of_the_earth_are_at_other_inertial_places(tmp_path, eof):
+    system = read_system(orbit_system(tmp_path, eof))
+    angles = np.array([0.0, np.pi / 2])
+    system.disperse(Dispersion("angle", ("orbit.earth_angle0",), angles, kind="list"))
+    found = simulate(system, members=2, duration="1").dataset
+    x, y, z = found["orbit.r_i"].to_numpy()[0, 0]
+    np.testing.assert_allclose(found["orbit.r_i"][0, 1], [-y, x, z], atol=1e-6)
 
 
 def test_orbit_files_that_cannot_be_used_are_refused_before_the_run(tmp_path, eof):

@@ -170,3 +170,45 @@ def test_bad_files_are_refused_by_name(tmp_path):
     (tmp_path / "torn.npz").write_bytes((tmp_path / "map.npz").read_bytes()[:100])
     with pytest.raises(ValueError, match=r"torn\.npz' is not an elevation model: it is damaged"):
         read_dem(tmp_path / "torn.npz")
+
+
+@pytest.mark.parametrize("turns", [-1, 0, 1])
+def test_slopes_do_not_depend_on_the_turn(turns):
+    """A model across 180 degrees rises by 90 m a cell to the east; asked from either side."""
+    step = np.radians(1e-3)
+    height = np.broadcast_to(90.0 * np.arange(21), (21, 21)).astype(np.float32)
+    dem = Dem(height, 0.0, np.radians(180.0) - 10 * step, step, step)
+    longitude = np.radians(180.0) + np.array([-3.0, 0.0, 3.0]) * step + 2 * np.pi * turns
+    north, east = dem.slopes(np.full(3, 10 * step), longitude)
+    np.testing.assert_allclose(east, 90.0 / (6371e3 * step * np.cos(10 * step)), rtol=1e-6)
+    np.testing.assert_allclose(north, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("void", [-9999.0, -32768.0, -32767.0, np.nan])
+def test_what_files_write_for_a_void_is_one(tmp_path, void):
+    """Never a height to interpolate with: halfway to -9999 m would be some -4,900 m."""
+    grid = np.full((4, 4), 200.0, np.float32)
+    grid[1, 1] = void
+    write_dem(Dem(grid, 0.0, 0.0, 0.01, 0.01), tmp_path / "holes.npz")
+    dem = read_dem(tmp_path / "holes.npz")
+    assert dem.n_void == 1
+    with pytest.raises(ValueError, match=r"is void at latitude .* in 1 of its 16 points"):
+        dem.at(0.005, 0.005)
+    np.testing.assert_array_equal(dem.filled().height, 200.0)
+
+
+@pytest.mark.parametrize("void", [-9999, -32767])
+def test_a_tile_may_write_other_voids(tmp_path, void):
+    raw = np.full((1201, 1201), 100, ">i2")
+    raw[0, 0] = void
+    raw.tofile(tmp_path / "N10E010.hgt")
+    assert read_dem(tmp_path / "N10E010.hgt").n_void == 1
+
+
+@pytest.mark.parametrize("height", [1e9, 9100.0, -13_000.0, 3.4e38, -np.inf])
+def test_what_is_no_height_of_the_earth_is_refused(tmp_path, height):
+    grid = np.full((3, 3), 200.0, np.float32)
+    grid[2, 1] = height
+    write_dem(Dem(grid, 0.0, 0.0, 0.01, 0.01), tmp_path / "high.npz")
+    with pytest.raises(ValueError, match=r"1 of its 9 heights are beyond .* in row 2, column 1"):
+        read_dem(tmp_path / "high.npz")

@@ -58,6 +58,10 @@ def test_a_small_file(tmp_path, namespace):
         ({"change": lambda t: t.replace("UTC=2022-09-18T05:31:20.250000", "NaT")}, "the epoch"),
         ({"vectors": GOOD[::-1]}, "epochs do not increase from number 0 to 1"),
         ({"vectors": GOOD[:1]}, "wants two epochs at least, got 1"),
+        (
+            {"change": lambda t: t.replace("7000001.0", "7000.0")},
+            "1 lies inside the Earth, 7000",
+        ),
         ({"vectors": []}, "wants two epochs at least, got 0"),
         ({"change": lambda t: t.replace("<Earth", "<!DOCTYPE a><Earth", 1)}, "document type"),
         ({"change": lambda t: ""}, "damaged or truncated"),
@@ -68,6 +72,71 @@ def test_damage_is_named_with_the_file(tmp_path, damage, message):
     with pytest.raises(ValueError, match=message) as caught:
         read_eof(path)
     assert str(path) in str(caught.value)
+
+
+LEAP = np.datetime64("2016-12-31T23:59:30")
+"""A minute about the last leap second: TAI - UTC was 36 s before it, and is 37 s after it."""
+
+
+def leap_vectors(tags, function, tai=True):
+    """State vectors every 10 s from `LEAP` on; their UTC tags are given, their TAI counts on."""
+    vectors = []
+    for k, tag in enumerate(tags):
+        r, v = function(np.array(10.0 * k))
+        atomic = f"<TAI>TAI={LEAP + np.timedelta64(36 + 10 * k, 's')}.000000</TAI>" if tai else ""
+        fields = zip(("X", "Y", "Z", "VX", "VY", "VZ"), [*r, *v], strict=True)
+        values = "".join(f"<{name}>{float(x)}</{name}>" for name, x in fields)
+        vectors.append(f"<OSV>{atomic}<UTC>UTC={tag}.000000</UTC>{values}</OSV>")
+    return vectors
+
+
+LEAP_TAGS = [
+    *("2016-12-31T23:59:30", "2016-12-31T23:59:40", "2016-12-31T23:59:50"),
+    *("2016-12-31T23:59:60", "2017-01-01T00:00:09", "2017-01-01T00:00:19"),
+]
+
+
+def test_a_leap_second_does_not_move_the_satellite(tmp_path):
+    """Every 10 s of TAI on a circle: 20 s after the leap second the circle, not 7.6 km from it.
+
+    The UTC tags are those of IERS Bulletin C 52: 23:59:59, 23:59:60, 0:00:00.
+    """
+    orbit = read_eof(written(tmp_path, leap_vectors(LEAP_TAGS, circle)))
+    np.testing.assert_array_equal(orbit.t, [0, 10, 20, 30, 40, 50])
+    assert orbit.utc[3] == np.datetime64("2017-01-01T00:00:00")
+    r, _ = orbit.at(45.0)
+    assert np.linalg.norm(r - circle(np.array(45.0))[0]) < 1e-3  # 7e6 (n h)^4 / 384 = 0.3 mm
+
+
+@pytest.mark.parametrize("night", ["2016-12-31", "2015-06-30"])
+def test_a_file_without_tai_is_refused_where_a_leap_second_may_lie(tmp_path, night):
+    first = np.datetime64(f"{night}T23:59:30")
+    tags = [first + np.timedelta64(10 * k, "s") for k in range(6)]
+    with pytest.raises(ValueError, match="a leap second may lie, and has no TAI"):
+        read_eof(written(tmp_path, leap_vectors(tags, circle, tai=False)))
+    same = [np.datetime64("2016-11-30T23:59:30") + (tag - first) for tag in tags]
+    assert read_eof(written(tmp_path, leap_vectors(same, circle, tai=False))).t[-1] == 50.0
+
+
+@pytest.mark.parametrize("wrong", ["2017-01-01T00:00:09.5", "2017-01-01T00:00:11"])
+def test_tags_that_contradict_each_other_are_refused(tmp_path, wrong):
+    tags = [*LEAP_TAGS[:4], wrong, *LEAP_TAGS[5:]]
+    text = [v.replace(".5.000000", ".500000") for v in leap_vectors(tags, circle)]
+    with pytest.raises(ValueError, match="TAI and UTC of state vector 4 do not differ"):
+        read_eof(written(tmp_path, text))
+
+
+def test_states_in_other_units_are_refused(tmp_path):
+    path = written(tmp_path, change=lambda text: text.replace('unit="m">-1', 'unit="km">-1'))
+    with pytest.raises(ValueError, match="state vector 1 has Y in 'km', not 'm'"):
+        read_eof(path)
+
+
+def circle(t, n=1.1e-3):
+    c, s = np.cos(n * t), np.sin(n * t)
+    zero = np.zeros_like(t)
+    r = 7e6 * np.stack([c, s, zero], axis=-1)
+    return r, 7e6 * n * np.stack([-s, c, zero], axis=-1)
 
 
 def cubic(t):
@@ -97,13 +166,6 @@ def test_a_cubic_is_reproduced():
 def test_error_falls_with_the_fourth_power_of_the_spacing():
     """Cubic Hermite on a circle: h^4 / 384 of the fourth derivative at the middle."""
     n = 1.1e-3
-
-    def circle(t):
-        c, s = np.cos(n * t), np.sin(n * t)
-        zero = np.zeros_like(t)
-        r = 7e6 * np.stack([c, s, zero], axis=-1)
-        return r, 7e6 * n * np.stack([-s, c, zero], axis=-1)
-
     spacings = np.array([60.0, 30.0, 15.0])
     errors = []
     for h in spacings:

@@ -1,0 +1,46 @@
+"""Symbolic components with noise: what zero parameters cancel is neither drawn nor computed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.kernels.symbolic import SymbolicComponent
+from terrafix.models.core.model import Model
+
+
+class NoisyComponent(SymbolicComponent):
+    """A symbolic component whose noise is scaled by parameters from zero on.
+
+    In a simulation its model is without the noise that parameters cancel which are zero for every
+    member, dispersions included. Streams are named, so the numbers of the others stay. Where
+    parameters can still change (an exported FMU), and where noise is a constant (a linear
+    analysis), the model is whole.
+    """
+
+    _silent: tuple[Any, dict[frozenset[str], Model]] | None = None
+
+    @property
+    def model(self) -> Any:
+        """The model, without the noise that is zero for every member."""
+        whole = super().model
+        if self._environment is None or self._environment.quiet:
+            return whole
+        zero = frozenset(
+            n
+            for n, s in self.settings().items()
+            if isinstance(s, Parameter)
+            and s.minimum == 0.0
+            and n in whole.parameters
+            and not self._settings[n].any()
+        )
+        if self._silent is None or self._silent[0] is not whole:
+            self._silent = (whole, {})
+        known = self._silent[1]
+        if zero not in known:
+            known[zero] = whole.without_noise_of(zero)
+        return known[zero]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to another process: no models, which are made there."""
+        return {k: v for k, v in super().__getstate__().items() if k != "_silent"}

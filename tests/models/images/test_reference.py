@@ -1,0 +1,67 @@
+"""Geocoded references: places between tie points, across the date line and about a pole."""
+
+import numpy as np
+import pytest
+
+from terrafix.models.images.reference import Reference, read_reference, write_reference
+
+ROWS, COLUMNS = np.array([0.0, 50.0, 100.0]), np.array([0.0, 40.0, 80.0])
+
+
+def reference(longitude_deg, latitude_deg=(10.0, 10.01, 10.02)):
+    """Tie points of which the longitude goes on with the column, the latitude with the row."""
+    latitude, longitude = np.meshgrid(latitude_deg, longitude_deg, indexing="ij")
+    return Reference(
+        np.ones((101, 81), np.float32),
+        ROWS,
+        COLUMNS,
+        np.radians(latitude),
+        np.radians(longitude),
+        np.zeros((3, 3)),
+    )
+
+
+@pytest.mark.parametrize(
+    "longitude_deg",
+    [
+        (179.98, 179.999, -179.982),
+        (-179.982, 179.999, 179.98),  # a descending pass, seen from the east
+        (179.98, -179.98, -179.94),
+        (359.98, 0.0, 0.02),
+        (-0.02, 0.0, 0.02),
+    ],
+)
+def test_places_go_on_across_the_date_line(longitude_deg):
+    """Halfway between two tie points is the mean of their longitudes on the circle."""
+    made = reference(longitude_deg)
+    points = np.exp(1j * np.radians(longitude_deg))
+    for column, (a, b) in ((20.0, points[:2]), (60.0, points[1:])):
+        latitude, longitude, _ = made.place(25.0, column)
+        assert latitude == pytest.approx(np.radians(10.005), abs=1e-14)
+        assert np.angle(np.exp(1j * longitude) / (a + b)) == pytest.approx(0.0, abs=1e-14)
+
+
+def test_a_file_keeps_what_crosses_the_date_line(tmp_path):
+    path = tmp_path / "reference.npz"
+    write_reference(reference((179.98, -179.98, -179.94)), path)
+    _, longitude, _ = read_reference(path).place(0.0, 20.0)
+    assert abs(np.degrees(longitude)) == pytest.approx(180.0, abs=1e-12)
+
+
+def test_longitudes_are_told_in_the_references_own_turn():
+    made = reference((179.98, -179.98, -179.94))
+    own = np.degrees(made.own_turn(np.radians([179.99, -179.99, 180.01, 0.0])))
+    span = np.degrees([made.longitude.min(), made.longitude.max()])
+    assert ((own[:3] > span[0]) & (own[:3] < span[1])).all()
+    np.testing.assert_allclose(np.abs(own[:3] - own[0]), [0.0, 0.02, 0.02], atol=1e-9)
+    assert not span[0] < own[3] < span[1]
+
+
+def test_a_reference_about_a_pole_is_refused():
+    with pytest.raises(ValueError, match=r"lies about a pole: .* changes by 120 deg"):
+        reference((0.0, 120.0, 240.0), latitude_deg=(89.99, 89.992, 89.994))
+
+
+def test_latitudes_in_other_units_are_refused():
+    with pytest.raises(ValueError, match="latitude of a reference is beyond a pole"):
+        reference((0.0, 0.01, 0.02), latitude_deg=(91.0, 91.1, 91.2))
