@@ -9,7 +9,9 @@ maximizes their correlation
 .. math:: \rho = \frac{\sum (a - \bar a)(b - \bar b)}
                        {\sqrt{\sum (a - \bar a)^2 \sum (b - \bar b)^2}}
 
-is found by enhanced correlation coefficients [2]_, to a fraction of a pixel.
+is found by enhanced correlation coefficients [2]_, to a fraction of a pixel. Where all that two
+images share lies along a line (a causeway, a coast), nothing holds stretch and shear across it, and
+far from it they would move the image by pixels: shift and rotation alone are sought there.
 
 Features agree by chance, too, and a straight shore correlates wherever it is moved along itself.
 What these do not do is correlate at one shift in every part of the image: the peak of correlation
@@ -71,6 +73,9 @@ _TURN, _GROWTH = float(np.radians(30.0)), 1.5
 """How much a feature may be turned and grown between the images."""
 _FEWEST = 7
 """Features that must share a transform: fewer also share one by chance."""
+_NARROW = 0.1
+"""Share of the image's sides: tie points that scatter less along any direction are a line [-]. The
+standard deviation of what is spread evenly is 0.29 of a side."""
 _STRETCH = 1.08
 """Largest stretch along any direction, either way: image and reference have like pixels."""
 _SEEN = 0.8
@@ -203,12 +208,15 @@ def matched(
         return _refused("too few features are shared", inliers)
     if not _plausible(transform):
         return _refused("features agree on no plausible transform", inliers)
+    rigid = _is_line(inliers[:, :2], image.amplitude.shape)
+    if rigid:
+        transform = _rotation_and_shift(inliers)
     warped, seen = _warped(reference, transform, image.amplitude.shape)
     if seen < _SEEN:
         return _refused("it lies beyond the edge of the reference", inliers)
     shift, _ = _peak(_block_correlations(image.smooth, warped).sum(axis=0))
     transform[:, 2] += transform[:, :2] @ shift
-    aligned, correlation = _aligned(image, reference, transform)
+    aligned, correlation = _aligned(image, reference, transform, rigid=rigid)
     if aligned is None or not _plausible(aligned):
         return _refused("correlation finds no peak where features put it", inliers)
     moved = np.linalg.norm((aligned - transform) @ [*middle, 1.0])
@@ -247,6 +255,21 @@ def _plausible(transform: FloatArray) -> bool:
     linear = transform[:, :2]
     stretch = np.linalg.svd(linear, compute_uv=False)
     return bool(np.linalg.det(linear) > 0 and stretch[0] < _STRETCH and stretch[1] > 1 / _STRETCH)
+
+
+def _is_line(points: FloatArray, shape: tuple[int, ...]) -> bool:
+    """Whether points (n, 2) of an image scatter too little along some direction."""
+    least = np.sqrt(max(float(np.linalg.eigvalsh(np.cov(points.T))[0]), 0.0))
+    return bool(least < _NARROW * min(shape))
+
+
+def _rotation_and_shift(inliers: FloatArray) -> FloatArray:
+    """Transform (2, 3) without stretch and shear that fits features best (Kabsch)."""
+    here, there = inliers[:, :2], inliers[:, 2:]
+    middles = here.mean(axis=0), there.mean(axis=0)
+    left, _, right = np.linalg.svd((there - middles[1]).T @ (here - middles[0]))
+    turn = left @ np.diag([1.0, np.linalg.det(left @ right)]) @ right
+    return np.c_[turn, middles[1] - turn @ middles[0]]
 
 
 def _shared_transform(
@@ -300,15 +323,16 @@ def _warped(
 
 
 def _aligned(
-    image: Searchable, reference: Searchable, transform: FloatArray
+    image: Searchable, reference: Searchable, transform: FloatArray, *, rigid: bool
 ) -> tuple[FloatArray | None, float]:
-    """Affine transform near a given one that maximizes correlation, and the correlation."""
+    """Transform near a given one that maximizes correlation, and the correlation."""
     xy = np.ascontiguousarray(transform[::-1][:, [1, 0, 2]], np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ROUNDS, _CLOSE)
     try:
         opencv: Any = cv2
+        motion = cv2.MOTION_EUCLIDEAN if rigid else cv2.MOTION_AFFINE
         correlation, found = opencv.findTransformECC(
-            image.smooth, reference.smooth, xy, cv2.MOTION_AFFINE, criteria, None, 1
+            image.smooth, reference.smooth, xy, motion, criteria, None, 1
         )
     except cv2.error:  # it raises where the images do not overlap or do not correlate
         return None, 0.0

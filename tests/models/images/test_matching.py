@@ -160,6 +160,64 @@ def test_an_unknown_transform_is_refused(scene):
         matched(scene[1], scene[1], kind="homography")
 
 
+def causeway(rng, width=24, n_points=40, shape=(620, 620)):
+    """Mean amplitude of a narrow strip of land in the sea, and its direction [rad]."""
+    angle = rng.uniform(0, np.pi)
+    y, x = np.mgrid[: shape[0], : shape[1]] - 309.5
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    land = np.abs(across - 8 * np.sin(along / 90 + rng.uniform(0, 6))) < width / 2
+    texture = np.sign(cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), 6))
+    power = np.where(land, np.exp(0.8 * texture), 0.02)
+    points = rng.choice(np.flatnonzero(land), n_points, replace=False)
+    power.flat[points] += 60
+    return np.sqrt(cv2.GaussianBlur(power, (0, 0), 0.7)), angle
+
+
+@pytest.fixture(scope="module")
+def along_a_line():
+    """Matches of chips in which a causeway lies 50 to 105 pixels off the middle, and errors."""
+    found = []
+    for seed in range(4):
+        rng = np.random.default_rng([seed, 5])
+        mean, angle = causeway(rng)
+        reference = Searchable(speckled(mean, rng))
+        axes = np.array([[np.sin(angle), np.cos(angle)], [np.cos(angle), -np.sin(angle)]])
+        for _ in range(6):
+            off = rng.uniform(-60, 60), rng.uniform(50, 105) * rng.choice([-1, 1])
+            center = 309.5 + off @ axes
+            chip = speckled(cut(mean, center, 256, rng.uniform(-12, 12)).astype(float), rng)
+            match = matched(Searchable(chip), reference)
+            found.append((match, np.array([match.row, match.column]) - center))
+    return found
+
+
+def test_a_scene_that_is_a_line_is_matched_by_rotation_and_shift(along_a_line):
+    """Six parameters moved 3 of 18 by more than 1.5 pixels, at claimed sigmas of 0.1 to 0.4."""
+    accepted = [(m, e) for m, e in along_a_line if m.accepted]
+    assert len(accepted) >= 8
+    assert max(np.linalg.norm(e) for _, e in accepted) < 1.5
+    ratios = np.array([e / m.sigma.max() for m, e in accepted])
+    assert np.sqrt(np.mean(ratios**2)) < 2.0  # sigmas of the larger axis: 1 at most, or nearly
+    for m, _ in accepted:
+        np.testing.assert_allclose(np.linalg.svd(m.transform[:, :2])[1], 1.0, atol=1e-6)
+
+
+def test_what_is_held_worse_than_the_bar_is_refused(along_a_line):
+    """0.6 pixels: right matches have a standard error of 0.1 to 1 pixel, wrong ones 5 and more."""
+    assert max(m.sigma.max() for m, _ in along_a_line if m.accepted) <= 0.6
+    loose = [m for m, _ in along_a_line if m.reason == "its parts do not agree on where it lies"]
+    assert loose
+    assert all(m.sigma.max() > 0.6 for m in loose)
+
+
+def test_a_scene_with_width_may_be_stretched(scene):
+    """3 % larger: features in both directions hold a scale."""
+    mean, reference, rng = scene
+    chip = speckled(cut(mean, (310, 300), 256, 0.0, 1.03).astype(float), rng)
+    match = matched(Searchable(chip), reference)
+    np.testing.assert_allclose(np.linalg.svd(match.transform[:, :2])[1], 1 / 1.03, rtol=3e-3)
+
+
 def two_looks(name, radar):
     """Amplitudes of two disjoint looks of recorded echo."""
     file = DATA / "radarsat1_vancouver" / f"{name}.npz"
