@@ -24,7 +24,7 @@ class NoisyComponent(SymbolicComponent):
     def model(self) -> Any:
         """The model, without the noise that is zero for every member."""
         whole = super().model
-        if self._environment is None or self._environment.quiet:
+        if self.lent is None or self.lent.quiet:
             return whole
         zero = frozenset(
             n
@@ -32,7 +32,7 @@ class NoisyComponent(SymbolicComponent):
             if isinstance(s, Parameter)
             and s.minimum == 0.0
             and n in whole.parameters
-            and not self._settings[n].any()
+            and not self.parameter_values[n].any()
         )
         if self._silent is None or self._silent[0] is not whole:
             self._silent = (whole, {})
