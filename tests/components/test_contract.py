@@ -243,6 +243,7 @@ def _components(file: Path) -> list[str]:
     """Names of the component classes that a module defines for use, from its text."""
     tree = ast.parse(file.read_text())
     classes = [n for n in tree.body if isinstance(n, ast.ClassDef) and n.name[0] != "_"]
-    bases = ("Component", "SymbolicComponent", "Evaluation", "Playback", "_Echo", "_Reference")
+    bases = ("Component", "SymbolicComponent", "NoisyComponent", "Evaluation", "Playback")
+    bases += ("_Echo", "_Reference")
     derived = [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
     return [name for name in derived if name not in bases]
