@@ -8,6 +8,7 @@ apply the fix that much later; this delay is not modeled.)
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from terrafix.models.radar.echo import Acquisition, simulated_echo
 from terrafix.models.radar.recording import RecordedLines, read_recording
 
 RADAR: dict[str, Any] = {"shape": (6,), "unit": RADAR_UNITS, "labels": RADAR_LABELS}
+_log = logging.getLogger(__name__)
 ECHO: dict[str, Any] = {"shape": (None, None), "dtype": np.complex64}
 _BEYOND = 5.0
 """Arc beyond all apertures [s]: the corners of the surface that is looked up are seen that late."""
@@ -209,7 +211,7 @@ class RecordedEcho(_Echo):
 
     def _step_impl(self, t: float, dt: float) -> None:
         path = file_of_step(self)
-        lines = read_lines(self, path)
+        lines = read_lines(self, path, report=True)
         self._check_time(lines, path, t)
         near = float(common(self, "range0"))
         near += (lines.first_cell - 1) * self._radar().range_spacing
@@ -223,16 +225,19 @@ def generator(component: Component) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
 
 
-def read_lines(component: Component, path: Path) -> RecordedLines:
-    """Recorded lines in a file of a component."""
+def read_lines(component: Component, path: Path, *, report: bool = False) -> RecordedLines:
+    """Recorded lines in a file of a component; `report` says if some were lost."""
     try:
-        return read_recording(path)
+        lines = read_recording(path)
     except (OSError, ValueError) as error:
         raise ConfigurationError(
             f"'{component.name}' cannot read its echo: {error}\n"
             f"  set {component.name}.folder and {component.name}.files, or TERRAFIX_DATA to the "
             "folder with the data"
         ) from error
+    if report and lines.told():
+        _log.warning("'%s' reads '%s': %s", component.name, path.name, lines.told())
+    return lines
 
 
 def require_files(component: Component, duration: float) -> list[tuple[float, Path]]:
