@@ -156,7 +156,7 @@ class RecordedReference(_Reference):
 
     def _step_impl(self, t: float, dt: float) -> None:
         path = file_of_step(self)
-        lines = read_lines(self, path)
+        lines = read_lines(self, path, report=True)
         radar = Radar(*map(float, self.radar))
         first_time = (lines.first_line - float(common(self, "start_line"))) / radar.prf - t
         near = float(common(self, "range0")) + (lines.first_cell - 1) * radar.range_spacing

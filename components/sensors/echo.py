@@ -213,7 +213,7 @@ class RecordedEcho(_Echo):
 
     def _step_impl(self, t: float, dt: float) -> None:
         path = file_of_step(self)
-        lines = read_lines(self, path)
+        lines = read_lines(self, path, report=True)
         self._check_time(lines, path, t)
         near = float(common(self, "range0"))
         near += (lines.first_cell - 1) * self._radar().range_spacing

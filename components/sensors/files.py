@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from terrafix.cosim.basics.clock import Rate
@@ -9,17 +10,22 @@ from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.models.radar.recording import RecordedLines, read_recording
 
+_log = logging.getLogger(__name__)
 
-def read_lines(component: Component, path: Path) -> RecordedLines:
-    """Recorded lines in a file of a component."""
+
+def read_lines(component: Component, path: Path, *, report: bool = False) -> RecordedLines:
+    """Recorded lines in a file of a component; `report` says if some were lost."""
     try:
-        return read_recording(path)
+        lines = read_recording(path)
     except (OSError, ValueError) as error:
         raise ConfigurationError(
             f"'{component.name}' cannot read its echo: {error}\n"
             f"  set {component.name}.folder and {component.name}.files, or TERRAFIX_DATA to the "
             "folder with the data"
         ) from error
+    if report and lines.told():
+        _log.warning("'%s' reads '%s': %s", component.name, path.name, lines.told())
+    return lines
 
 
 def require_files(component: Component, duration: float) -> list[tuple[float, Path]]:

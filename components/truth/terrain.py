@@ -58,6 +58,7 @@ class Terrain(Component):
 
     def _read(self) -> Dem:
         source, path = self.setting("source"), self.setting("dem_file")
+        self._n_filled = 0
         if source == "flat":
             return flat_dem(float(shared_setting(self, "flat_height")))
         if source == "file" and path is None:
@@ -67,7 +68,8 @@ class Terrain(Component):
             )
         try:
             dem = read_jacksboro() if source == "jacksboro" else read_dem(path)
-            self._n_filled = dem.n_void if self.setting("fill_voids") else 0
+            if self.setting("fill_voids"):
+                self._n_filled = dem.n_void
             dem = dem.filled() if self._n_filled else dem
         except (OSError, ValueError) as error:
             raise ConfigurationError(

@@ -5,6 +5,7 @@ Files are read with errors that say what is wrong with the file.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
+
+from terrafix.models.core.formats import ARCHIVE, kind_of
 
 FloatArray = NDArray[np.float64]
 """Real numbers."""
@@ -45,20 +48,41 @@ def read_arrays(
     """
     if not path.is_file():
         raise FileNotFoundError(f"'{path}' {'is a folder' if path.is_dir() else 'is not there'}")
+    whole = f"{what} is a file of NumPy (.npz) with the arrays {', '.join(keys)}"
+    found, cure = kind_of(path)
+    if found and found != ARCHIVE:
+        raise ValueError(f"'{path}' is not {what}: it is {found}\n  {whole}\n  {cure}")
     try:
         with path.open("rb") as file:
             archive = np.load(file, allow_pickle=False)
             if not hasattr(archive, "files"):
-                raise ValueError("it holds one array without a name")
+                raise ValueError("it is no file of NumPy (.npz)")
+            strange = [name for name in archive.zip.namelist() if not name.endswith(".npy")]
+            if strange:
+                raise ValueError(f"it is a zip archive of other files ('{strange[0]}')")
             missing = [k for k in keys if k not in archive.files]
             if missing:
                 raise ValueError(
                     f"it has no '{missing[0]}'; it holds {', '.join(archive.files) or 'nothing'}"
                 )
-            return {k: archive[k] for k in (*keys, *optional) if k in archive.files}
-    except (OSError, EOFError, BadZipFile, ValueError, KeyError) as error:
+            return {k: _array(archive, k) for k in (*keys, *optional) if k in archive.files}
+    except (OSError, EOFError, BadZipFile, zlib.error, ValueError, KeyError) as error:
         reason = str(error) if isinstance(error, ValueError) else f"it is damaged ({error})"
+        if "allow_pickle" in reason:
+            reason = "it is damaged, or of a kind that is not known"
+        raise ValueError(f"'{path}' is not {what}: {reason}\n  {whole}") from error
+
+
+def _array(archive: Any, key: str) -> NDArray[Any]:
+    try:
+        array = np.asarray(archive[key])
+    except ValueError as error:
+        if "allow_pickle" not in str(error):
+            raise
         raise ValueError(
-            f"'{path}' is not {what}: {reason}\n  {what} is a file of NumPy (.npz) with the arrays "
-            f"{', '.join(keys)}"
+            f"its '{key}' holds Python objects (a list of arrays of several lengths, say), "
+            "not an array of numbers"
         ) from error
+    if array.dtype.kind not in "biufc":
+        raise ValueError(f"its '{key}' holds {array.dtype}, not numbers")
+    return array

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray, Single, read_arrays
+from terrafix.models.core.formats import kind_of
 
 KEYS = ("height_m", "latitude0_deg", "longitude0_deg", "latitude_step_deg", "longitude_step_deg")
 """Arrays in a file of `write_dem`."""
@@ -249,8 +250,10 @@ def read_hgt(path: Path) -> Dem:
         raise ValueError(f"'{path}': its name must give the southwestern corner, as N44W072.hgt")
     size = path.stat().st_size
     if size not in _SIZES:
+        found, cure = kind_of(path)
         raise ValueError(
-            f"'{path}' has {size} bytes; a tile of SRTM has {' or '.join(map(str, _SIZES))}"
+            f"'{path}' {found and f'is {found}, '}has {size} bytes; a tile of SRTM has "
+            f"{' or '.join(map(str, _SIZES))}" + (f"\n  {cure}" if found else "")
         )
     n = _SIZES[size]
     raw = np.fromfile(path, ">i2").reshape(n, n)[::-1]
@@ -311,7 +314,11 @@ def read_dem(path: Path) -> Dem:
     if path.suffix.lower() == ".hgt":
         return read_hgt(path)
     if path.suffix.lower() != ".npz":
-        raise ValueError(f"'{path}' is no elevation model: a tile of SRTM (.hgt) or arrays (.npz)")
+        found, cure = kind_of(path)
+        raise ValueError(
+            f"'{path}' is no elevation model: a tile of SRTM (.hgt) or arrays (.npz)"
+            + (f"\n  it is {found}: {cure}" if found else "")
+        )
     arrays = read_arrays(path, KEYS, "an elevation model")
     try:
         south, west, north, east = (float(np.radians(float(arrays[k]))) for k in KEYS[1:])

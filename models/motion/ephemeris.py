@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.formats import kind_of
 from terrafix.models.geometry.earth import EARTH
 
 MAX_BYTES = 64 * 1024 * 1024
@@ -124,6 +125,9 @@ def read_eof(path: str | Path) -> Ephemeris:
     try:
         root = ET.fromstring(content)
     except ET.ParseError as error:
+        found, cure = kind_of(path)
+        if found not in ("", "empty", "text", "XML"):
+            raise ValueError(f"{path}: it is {found}, no orbit file (.EOF)\n  {cure}") from error
         raise ValueError(f"{path}: damaged or truncated orbit file: {error}") from error
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]  # files differ in their namespace
