@@ -101,10 +101,10 @@ class Result(Shown):
         ConfigurationError
             If it cannot be written.
         """
-        from terrafix.cosim.records.places import writable
+        from terrafix.cosim.records.places import result_target
         from terrafix.cosim.records.results import write_netcdf
 
-        target = writable(Path(path))
+        target = result_target(path)
         write_netcdf(self.dataset, target)
         self.out = target
 

@@ -11,6 +11,7 @@ import json
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -193,8 +194,8 @@ class Recorder:
                 file.unlink()
                 continue
             if use < len(times):
-                arrays = {f"v{i}": v[:use] for i, v in enumerate(values)}
-                write_atomically(file, lambda f, t=times[:use], a=arrays: np.savez(f, t=t, **a))
+                arrays: dict[str, Any] = {f"v{i}": v[:use] for i, v in enumerate(values)}
+                write_atomically(file, partial(np.savez, t=times[:use], **arrays))
             kept += use
             self._n_files = number + 1
         if kept < n:

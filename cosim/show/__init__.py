@@ -1,1 +1,1 @@
-"""How numbers, tables and figures look to a person; knows data, not systems."""
+"""How numbers, tables, figures and pages look to a person; knows data, not systems."""

@@ -154,3 +154,12 @@ def test_impossible_runs_are_refused(options, message, toys, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigurationError, match=message):
         simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), **options)
+
+
+def test_a_result_is_saved_where_it_can_be(toys, tmp_path):
+    result = simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"))
+    result.save(tmp_path / "run.nc")
+    assert result.out == tmp_path / "run.nc"
+    assert read_result(result.out).equals(result.dataset)
+    with pytest.raises(ConfigurationError, match=r"results are NetCDF: name it 'run\.nc'"):
+        result.save(tmp_path / "run.txt")

@@ -4,66 +4,47 @@ from __future__ import annotations
 
 import io
 import sys
-from html import escape
 from inspect import getdoc
+from pathlib import Path
 from typing import Any
 
 from terrafix.cosim.basics.clock import text_seconds
 from terrafix.cosim.declare.component import docstring
 from terrafix.cosim.exchange.fmi.write.layout import Layout, Part
 from terrafix.cosim.exchange.fmi.write.variables import Variable
+from terrafix.cosim.show.templates import filled
 
-_STYLE = (
-    "body{font:15px/1.5 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;"
-    "color:#222}table{border-collapse:collapse;width:100%}td,th{border-bottom:1px solid #ccd;"
-    "padding:.3em .6em;text-align:left;vertical-align:top}th{background:#f3f6f9}"
-    "pre{background:#f3f6f9;padding:1em;overflow-x:auto;white-space:pre-wrap}code{font-size:.95em}"
-)
+_TEMPLATE = Path(__file__).with_name("page.html.j2")
+_TITLES = {
+    "input": "Inputs",
+    "output": "Outputs",
+    "parameter": "Parameters",
+    "local": "Local variables",
+}
 
 
 def page(layout: Layout) -> str:
     """Write documentation/index.html: one page, without anything from outside."""
     source = layout.source
-    tick = text_seconds(source.base)
-    body = [
-        f"<h1>{escape(source.name)}</h1>",
-        f"<p>{escape(source.doc)}</p>",
-        "<h2>Time</h2>",
-        f"<p>Steps are multiples of {tick} s; another step is refused (Discard). Time inside is a "
-        "count of these ticks.</p><ul>",
-    ]
-    body += [f"<li><b>{escape(p.name)}</b> steps {escape(str(p.rate))}</li>" for p in layout.parts]
-    body.append("</ul>")
-    body.append(
-        "<p>Inputs <em>read at the end of a step</em> belong to the time the step ends: set them "
-        "to their value at t + h before the step from t to t + h, and the results are those of the "
-        "native component. A master that sets all inputs to their values at t delays each such "
-        "link by one step. Inputs <em>read at the start</em> belong to the time the step begins. "
-        "A message is its fields, its time of validity <code>.t</code> and its number "
-        "<code>.sequence</code>: a new number is a new message.</p>"
+    variables = [*layout.reals, *layout.integers]
+    rows = {
+        title: [_row(v) for v in variables if v.causality == causality]
+        for causality, title in _TITLES.items()
+    }
+    return filled(
+        _TEMPLATE,
+        name=source.name,
+        doc=source.doc,
+        tick=text_seconds(source.base),
+        parts=[{"name": p.name, "rate": p.rate, "text": _text(p)} for p in layout.parts],
+        continuous=layout.continuous is not None,
+        tables=[(title, found) for title, found in rows.items() if found],
     )
-    if layout.continuous is not None:
-        body.append(
-            "<p>In model exchange, the equations below are integrated by the importer; in "
-            "co-simulation, by the classical Runge-Kutta method of order four over each step.</p>"
-        )
-    for causality, title in (
-        ("input", "Inputs"),
-        ("output", "Outputs"),
-        ("parameter", "Parameters"),
-        ("local", "Local variables"),
-    ):
-        chosen = [v for v in [*layout.reals, *layout.integers] if v.causality == causality]
-        if chosen:
-            body += [f"<h2>{title}</h2>", _table(chosen)]
-    body.append("<h2>Equations</h2>")
-    for part in layout.parts:
-        text = "\n\n".join(filter(None, (docstring(type(part.component)), _equations(part))))
-        body.append(f"<h3>{escape(part.name)}</h3><pre>{escape(text)}</pre>")
-    return (
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(source.name)}'
-        f"</title><style>{_STYLE}</style></head><body>{''.join(body)}</body></html>\n"
-    )
+
+
+def _text(part: Part) -> str:
+    """What a component says of itself, and where its equations stand."""
+    return "\n\n".join(filter(None, (docstring(type(part.component)), _equations(part))))
 
 
 def _equations(part: Part) -> str:
@@ -76,21 +57,22 @@ def _equations(part: Part) -> str:
     return ""
 
 
-def _table(variables: list[Variable]) -> str:
-    rows = ["<tr><th>Name</th><th>Shape</th><th>Unit</th><th>Frame</th><th>Meaning</th></tr>"]
-    for v in variables:
-        unit = v.unit if isinstance(v.unit, str) else ", ".join(v.unit)
-        shape = " x ".join(map(str, v.shape)) or "-"
-        doc = v.doc
-        if v.causality == "input":
-            doc += "; read at the start of a step" if v.at_start else "; read at the end of a step"
-        if v.causality == "parameter":
-            values = v.starts() if v.kind == "real" else [v.start]
-            shown = ", ".join(f"{x:.9g}" for x in values[:9])
-            doc += f" (start: {shown}{', ...' if len(values) > 9 else ''})"
-        cells = (f"<code>{escape(v.name)}</code>", shape, escape(unit), v.frame or "-", escape(doc))
-        rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>")
-    return f"<table>{''.join(rows)}</table>"
+def _row(v: Variable) -> dict[str, str]:
+    """A variable as its table shows it."""
+    doc = v.doc
+    if v.causality == "input":
+        doc += "; read at the start of a step" if v.at_start else "; read at the end of a step"
+    if v.causality == "parameter":
+        values = v.starts() if v.kind == "real" else [v.start]
+        shown = ", ".join(f"{x:.9g}" for x in values[:9])
+        doc += f" (start: {shown}{', ...' if len(values) > 9 else ''})"
+    return {
+        "name": v.name,
+        "shape": " x ".join(map(str, v.shape)) or "-",
+        "unit": v.unit if isinstance(v.unit, str) else ", ".join(v.unit),
+        "frame": v.frame or "-",
+        "doc": doc,
+    }
 
 
 def icon(layout: Layout) -> bytes:
