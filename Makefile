@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 RUN := $(VENV)/.installed
 STAMP := $(VENV)/.installed-test
 OUT := .demo
+# tests start many processes: bytecode is worth keeping
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test quick lint types campaigns benchmarks clean
 
@@ -28,10 +30,11 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# an editable install is opaque to type checkers: check what would be installed
+# an editable install is opaque to type checkers: lay the tree out as it would be installed
 types: $(STAMP)
-	@rm -rf build/types
-	@$(BIN)/pip install -q --no-deps --disable-pip-version-check --target build/types .
+	@rm -rf build/types && mkdir -p build/types/terrafix
+	@ln -s $(addprefix $(CURDIR)/,$(wildcard src/terrafix/*) components cosim models) \
+	    build/types/terrafix
 	MYPYPATH=build/types $(BIN)/mypy -p terrafix
 
 ## minutes-long Monte Carlo campaigns, in the numbers of the papers
@@ -48,14 +51,16 @@ benchmarks: $(STAMP)
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
 	    then $(BIN)/python benchmarks/real_echo.py; fi
 
-$(RUN): pyproject.toml
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(RUN): pyproject.toml setup.py | $(BIN)/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e .
 	@touch $@
 
-$(STAMP): $(RUN)
+$(STAMP): pyproject.toml setup.py | $(BIN)/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[test]'
-	@touch $@
+	@touch $(RUN) $@
 
 clean:
 	rm -rf $(VENV) build $(OUT) *.egg-info src/*.egg-info

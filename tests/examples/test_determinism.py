@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from click.testing import CliRunner
 
+from terrafix.cli import main
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.records.results import read_result
@@ -65,19 +67,33 @@ def test_kernels_of_all_kinds_agree(hundred, kernel, monkeypatch):
         )
 
 
-def test_a_killed_run_resumes_to_the_same_bytes(tmp_path):
+def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, monkeypatch):
     """SIGKILL in the middle of a run from the command line, then --resume."""
-    common = [sys.executable, "-m", "terrafix", "run", str(SYSTEM), "--members", "5", "--quiet"]
-    common += ["--duration", "120", "--checkpoint-every", "7"]
-    whole, broken = tmp_path / "whole.nc", tmp_path / "broken.nc"
-    subprocess.run([*common, "--out", str(whole)], check=True)
-    process = subprocess.Popen([*common, "--out", str(broken)])
-    checkpoint = tmp_path / "broken.ckpt"
+    from test_campaign import plugin
+
+    system, whole, broken = (tmp_path / name for name in ("held.toml", "whole.nc", "broken.nc"))
+    system.write_text(SYSTEM.read_text() + '[component.hold]\ntype = "scalar_hold"\n')
+    hold = tmp_path / "hold"
+    parts = Path(__file__).parents[1] / "cosim" / "campaign"
+    monkeypatch.syspath_prepend(str(plugin(tmp_path)))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(parts), str(tmp_path)]))
+    words = ["run", str(system), "--members", "5", "--quiet"]
+    words += ["--duration", THREE_FIXES, "--checkpoint-every", "3"]
+
+    def fly(*more):
+        assert CliRunner().invoke(main, [*words, *map(str, more)]).exit_code == 0
+
+    fly("--out", whole)
+    hold.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "terrafix", *words, "--out", str(broken)],
+        env=os.environ | {"HOLD": str(hold), "HOLD_FROM": "0"},  # waits at 7 s
+    )
     deadline = time.monotonic() + 60
-    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+    while not (hold / "0").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
+    process.kill()
     assert process.wait() == -signal.SIGKILL, "the run ended before it could be killed"
     assert not broken.exists()
-    subprocess.run([*common, "--out", str(broken), "--resume", str(checkpoint)], check=True)
+    fly("--out", broken, "--resume", tmp_path / "broken.ckpt")
     assert_same_bytes(read_result(whole), read_result(broken))

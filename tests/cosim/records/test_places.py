@@ -1,5 +1,6 @@
 """Files of a run: nobody else writes there, nothing is lost, a resumed run finds its own."""
 
+import runpy
 import signal
 import subprocess
 import sys
@@ -18,7 +19,8 @@ from terrafix.cosim.records.results import read_result
 from terrafix.cosim.system.system import System
 
 SLOW = """
-    import sys, time
+    import time
+    from pathlib import Path
     from terrafix.cosim.declare.component import Component
     from terrafix.cosim.basics.clock import Rate
     from terrafix.cosim.declare.ports import Output, State
@@ -36,7 +38,8 @@ SLOW = """
         def _step_impl(self, t, dt):
             self.x += self.normals("w", 1)[:, 0]
             self.y = self.x
-            time.sleep(0.01 if "slow" in sys.argv else 0.0)
+            while t == 60 and Path(HOLD).exists():
+                time.sleep(0.01)
 
     system = System("slow", duration="300")
     system.add(Slow(), "s")
@@ -45,9 +48,16 @@ SLOW = """
 
 
 def script(folder, call):
+    """How to run the system in a process, which waits at t = 60 while there is a file "hold"."""
     file = folder / "slow.py"
-    file.write_text(textwrap.dedent(SLOW) + call + "\n")
+    file.write_text(f"HOLD = {str(folder / 'hold')!r}\n{textwrap.dedent(SLOW)}{call}\n")
     return [sys.executable, str(file)]
+
+
+def held(folder, call):
+    """The same, started and on its way to wait."""
+    (folder / "hold").touch()
+    return subprocess.Popen(script(folder, call))
 
 
 def wait_for(path):
@@ -59,10 +69,11 @@ def wait_for(path):
 
 def test_a_second_run_to_the_same_file_is_refused_while_the_first_writes(tmp_path, toys):
     out = tmp_path / "run.nc"
-    first = subprocess.Popen([*script(tmp_path, f"simulate(system, out={str(out)!r})"), "slow"])
+    first = held(tmp_path, f"simulate(system, out={str(out)!r})")
     wait_for(tmp_path / "run.nc.parts" / "manifest.json")
     with pytest.raises(ConfigurationError, match="another run is writing its records to"):
         simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
+    (tmp_path / "hold").unlink()
     assert first.wait(60) == 0
     assert len(read_result(out)["time"]) == 301
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.nc", "slow.py"]
@@ -72,16 +83,16 @@ def test_a_resumed_run_finds_its_result_file_again(tmp_path):
     """Killed, then resumed without naming the result: same bytes as never stopped."""
     out, checkpoint = tmp_path / "run.nc", tmp_path / "run.ckpt"
     call = f"simulate(system, out={str(out)!r}, checkpoint_every='50')"
-    killed = subprocess.Popen([*script(tmp_path, call), "slow"])
+    killed = held(tmp_path, call)
     wait_for(checkpoint)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
     assert not out.exists()
+    (tmp_path / "hold").unlink()
     resume = f"simulate(system, resume={str(checkpoint)!r})"
     subprocess.run(script(tmp_path, resume), check=True)
-    whole = f"simulate(system, out={str(tmp_path / 'whole.nc')!r})"
-    subprocess.run(script(tmp_path, whole), check=True)
-    a, b = read_result(out)["s.y"].to_numpy(), read_result(tmp_path / "whole.nc")["s.y"].to_numpy()
+    whole = runpy.run_path(script(tmp_path, "whole = simulate(system)")[1])["whole"].dataset
+    a, b = read_result(out)["s.y"].to_numpy(), whole["s.y"].to_numpy()
     assert a.tobytes() == b.tobytes()
     assert not (tmp_path / "run.nc.parts").exists()
 
@@ -89,7 +100,7 @@ def test_a_resumed_run_finds_its_result_file_again(tmp_path):
 def test_what_a_killed_run_left_is_kept_and_said(tmp_path, toys):
     out = tmp_path / "run.nc"
     call = f"simulate(system, out={str(out)!r}, checkpoint_every='50')"
-    killed = subprocess.Popen([*script(tmp_path, call), "slow"])
+    killed = held(tmp_path, call)
     wait_for(tmp_path / "run.ckpt")
     killed.send_signal(signal.SIGKILL)
     killed.wait()

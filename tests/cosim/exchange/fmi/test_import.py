@@ -225,12 +225,12 @@ def test_a_run_with_fmus_resumes_to_the_same_bytes(exported, tmp_path, isolate):
         return made
 
     first = Simulation(system(), members=2)
-    first.run_until("16.4")
+    first.run_until("8.2")
     write_checkpoint(tmp_path / "run.ckpt", first.get_state())
     second = Simulation(system(), members=2)
     second.set_state(read_checkpoint(tmp_path / "run.ckpt"))
     for simulation in (first, second):
-        simulation.run_until("24.6")
+        simulation.run_until("16.4")
     for path in ("orbit.r_e", "imu.delta_v_b", "predict.prior", "correct.estimate"):
         a, b = (s.master.wiring.slots[path].data for s in (first, second))
         assert np.array_equal(a, b), path
