@@ -67,7 +67,7 @@ class OrbitTruth(SymbolicComponent):
         mask = np.asarray(mask, np.bool_)
         # results that are not finite are not kept: those of the step before lie above
         if self.step_index:
-            r = self._states["r_i"] + self._states["v_i"] * self._dt[0]
+            r = self.state_arrays["r_i"] + self.state_arrays["v_i"] * self._dt[0]
         else:
             r = self.r0_i
         with np.errstate(over="ignore"):

@@ -12,7 +12,7 @@ from terrafix.cosim.engine.display import result_tables
 from terrafix.cosim.engine.result import Result
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
-from terrafix.cosim.files.reading import read_system
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.records.results import read_result
 
 OPEN_LOOP = Path(__file__).parents[3] / "examples/spacecraft_sar_open_loop.toml"
