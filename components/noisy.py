@@ -23,7 +23,7 @@ class NoisyComponent(SymbolicComponent):
     @property
     def model(self) -> Any:
         """The model, without the noise that is zero for every member."""
-        whole = super().model
+        whole: Any = self.whole_model
         if self.lent is None or self.lent.quiet:
             return whole
         zero = frozenset(

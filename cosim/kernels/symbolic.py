@@ -105,6 +105,11 @@ class SymbolicComponent(Component):
 
     @property
     def model(self) -> SymbolicModel:
+        """The model that is stepped: `whole_model`, unless a subclass leaves parts out."""
+        return self.whole_model
+
+    @property
+    def whole_model(self) -> SymbolicModel:
         """The model, built on first need for the present settings."""
         structure = tuple(
             (n, self.given_parameters.get(n))
@@ -138,7 +143,7 @@ class SymbolicComponent(Component):
 
     def takes(self, name: str) -> bool:
         """Whether a parameter has any effect, as the choices are now."""
-        return not isinstance(self.settings()[name], Parameter) or self.model.uses(name)
+        return not isinstance(self.settings()[name], Parameter) or self.whole_model.uses(name)
 
     def validate(self) -> None:
         """Check that every name of the model is a port or parameter of this component."""

@@ -189,7 +189,7 @@ def test_a_gauss_markov_bias_keeps_its_sigma_and_forgets():
 
 
 def streams(component):
-    return {a.name for a in component._kept[1].noise}
+    return {a.name for a in component._kept[2].noise}
 
 
 def test_an_inertial_sensor_draws_only_what_its_sigmas_let_through():
