@@ -148,7 +148,7 @@ class Model:
         The parameters in `zero` are zero in its expressions, though still declared.
         """
         gone = [self.parameters[k] for k in zero]
-        kinds = {}
+        kinds: dict[str, Any] = {}
         for kind in ("outputs", "next", "derivatives", "initial"):
             expressions = [ca.SX(e) for e in getattr(self, kind).values()]
             if expressions:

@@ -269,7 +269,7 @@ def _rotation_and_shift(inliers: FloatArray) -> FloatArray:
     middles = here.mean(axis=0), there.mean(axis=0)
     left, _, right = np.linalg.svd((there - middles[1]).T @ (here - middles[0]))
     turn = left @ np.diag([1.0, np.linalg.det(left @ right)]) @ right
-    return np.c_[turn, middles[1] - turn @ middles[0]]
+    return np.column_stack([turn, middles[1] - turn @ middles[0]])
 
 
 def _shared_transform(

@@ -250,10 +250,10 @@ def read_hgt(path: Path) -> Dem:
         raise ValueError(f"'{path}': its name must give the southwestern corner, as N44W072.hgt")
     size = path.stat().st_size
     if size not in _SIZES:
-        found, cure = kind_of(path)
+        kind, cure = kind_of(path)
         raise ValueError(
-            f"'{path}' {found and f'is {found}, '}has {size} bytes; a tile of SRTM has "
-            f"{' or '.join(map(str, _SIZES))}" + (f"\n  {cure}" if found else "")
+            f"'{path}' {kind and f'is {kind}, '}has {size} bytes; a tile of SRTM has "
+            f"{' or '.join(map(str, _SIZES))}" + (f"\n  {cure}" if kind else "")
         )
     n = _SIZES[size]
     raw = np.fromfile(path, ">i2").reshape(n, n)[::-1]

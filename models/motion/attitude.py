@@ -54,7 +54,7 @@ def lvlh_matrix(r: Any, u: Any) -> Any:
 
 def level_is_defined(r: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:
     """Whether a position and the velocity that is followed, (..., 3) each, have level axes."""
-    normal = np.linalg.norm(np.cross(u, r), axis=-1)
+    normal = np.linalg.norm(np.cross(np.asarray(u), np.asarray(r)), axis=-1)
     return np.asarray(
         normal > _LEAST_SINE * np.linalg.norm(u, axis=-1) * np.linalg.norm(r, axis=-1)
     )

@@ -107,7 +107,7 @@ def read_recording(path: Path) -> RecordedLines:
         _refuse_slips(echo)
     except ValueError as error:
         raise ValueError(f"'{path}' is not {what}: {error}") from error
-    return RecordedLines(echo, *first, np.flatnonzero(~np.any(echo, axis=1)) + 1)
+    return RecordedLines(echo, first[0], first[1], np.flatnonzero(~np.any(echo, axis=1)) + 1)
 
 
 def _places(arrays: dict[str, NDArray[Any]], n: int) -> NDArray[np.intp]:
@@ -132,7 +132,7 @@ def _places(arrays: dict[str, NDArray[Any]], n: int) -> NDArray[np.intp]:
             np.argmax(np.append(np.diff(numbers) <= 0, True) | (abs(numbers - whole) > _OFF_GRID))
         )
         raise ValueError(f"'{name}' does not count lines one by one: look at its element {k}")
-    return (whole - whole[0]).astype(np.intp)
+    return np.asarray(whole - whole[0], dtype=np.intp)
 
 
 def _refuse_slips(echo: ComplexArray) -> None:
@@ -140,7 +140,7 @@ def _refuse_slips(echo: ComplexArray) -> None:
     from scipy.ndimage import median_filter
 
     size = np.abs(echo)
-    there = size.any(axis=1)
+    there = np.any(size, axis=1)
     phase = np.divide(echo, size, out=np.zeros_like(echo), where=size > 0)
     alike = np.einsum("ij,ij->i", phase[1:], phase[:-1].conj()) / echo.shape[1]
     total = alike.sum()
