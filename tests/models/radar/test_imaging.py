@@ -200,7 +200,7 @@ def test_bad_reference_files_are_refused_by_name(tmp_path):
     with pytest.raises(ValueError, match="a reference: it has no 'rows'; it holds amplitude"):
         read_reference(tmp_path / "r.npz")
     np.save(tmp_path / "one.npy", np.zeros(3))
-    with pytest.raises(ValueError, match="it holds one array without a name"):
+    with pytest.raises(ValueError, match="it is one array of NumPy"):
         read_reference(tmp_path / "one.npy")
 
 
