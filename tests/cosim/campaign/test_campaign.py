@@ -342,12 +342,16 @@ def test_designs_fill_the_range_evenly(design):
 
 
 def test_correlated_draws_have_their_covariance():
-    from campaign_parts import Filter
-
+    from terrafix.cosim.basics.clock import Rate
+    from terrafix.cosim.declare.component import Component
     from terrafix.cosim.declare.parameters import Parameter
 
-    class Two(Filter):
+    class Two(Component):
+        default_rate = Rate("1")
         pair = Parameter(0.0, shape=(2,), unit="m")
+
+        def _step_impl(self, t, dt):
+            """Use it in no way that the engine could know."""
 
     system = scalar_system()
     system.add(Two(), "two")
