@@ -140,7 +140,7 @@ def touched(path: Path) -> set[str]:
             used |= {f"{node.module}.{a.name}" for a in node.names if a.name.startswith("_")}
         elif isinstance(node, ast.Attribute) and node.attr.startswith("_"):
             if ast.unparse(node.value) in ("self", "cls", "super()"):
-                own.add(node.attr)
+                own |= {node.attr} if isinstance(node.ctx, ast.Store) else set()
             elif not node.attr.startswith("__"):
                 used.add(ast.unparse(node))
     return {name for name in used if name.rpartition(".")[2] not in own}
