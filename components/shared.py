@@ -11,9 +11,10 @@ from terrafix.cosim.declare.parameters import Parameter
 
 
 def common(component: Component, name: str) -> FloatArray:
-    """What is the same for all active members."""
-    values = np.asarray(getattr(component, name))[component.environment.active]
-    if len(values) > 1 and np.any(values != values[:1]):
+    """What is the same for all active members, or for all where none is left at this instant."""
+    active = component.environment.active
+    values = np.asarray(getattr(component, name))[active if active.any() else slice(None)]
+    if active.any() and np.any(values != values[:1]):
         raise ConfigurationError(
             f"'{component.name}.{name}' differs between members, but its output is one for all\n"
             "  fly members with one truth: disperse what is known at the start and the sensors, "

@@ -121,32 +121,38 @@ class ImageFormer(Component):
 
     def _form(self, t: float, imager: Imager, fresh: Mask) -> None:
         wavelength = imager.radar.wavelength
-        velocity, slope = self._expected_velocity(wavelength)
         centroid, sigma = self._expected_centroid(wavelength)
         beam_range, beam_doppler = self.acquired.beam_range, self.acquired.beam_doppler
         chips: list[Single] = []
         known: dict[tuple[Processing, float], int] = {}
         values = {name: np.zeros(self.n_members) for name in IMAGE}
+        formed = np.zeros(self.n_members, np.bool_)
         for m in np.flatnonzero(fresh):
-            processings = [
-                imager.processing(f, velocity[m], slope[m])
-                for f in centroid_candidates(
-                    imager.fraction, imager.radar.prf, centroid[m], sigma[m]
-                )
-            ]
-            processing, focus = imager.focus(processings, float(velocity[m]))
-            own = imager.step * round(velocity[m] / imager.step)
-            chosen = focus.velocity if focus.accepted else own
             beam = float(beam_range[m]), float(beam_doppler[m])
-            image = imager.image(processing, chosen)
-            rows, columns, center = self._place(image, *beam)
+            try:
+                velocity, slope = self._expected_velocity(m, wavelength)
+                processings = [
+                    imager.processing(f, velocity, slope)
+                    for f in centroid_candidates(
+                        imager.fraction, imager.radar.prf, centroid[m], sigma[m]
+                    )
+                ]
+                processing, focus = imager.focus(processings, velocity)
+                own = imager.step * round(velocity / imager.step)
+                chosen = focus.velocity if focus.accepted else own
+                image = imager.image(processing, chosen)
+                rows, columns, center = self._place(image, *beam)
+            except ValueError as error:
+                self._refuse(m, error)
+                continue
             if (processing, chosen) not in known:
                 known[processing, chosen] = len(chips)
                 chips.append(detected(image.data[rows, columns], self._looks))
-            if self.show_unfocused and m == np.flatnonzero(fresh)[0]:
+            if self.show_unfocused and not formed.any():
                 blurred = imager.image(processing, own)
                 rows, columns, _ = self._place(blurred, *beam)
                 self.unfocused = detected(blurred.data[rows, columns], self._looks)
+            formed[m] = True
             values["index"][m] = known[processing, chosen]
             values["row"][m], values["column"][m] = center
             values["focused"][m] = focus.accepted
@@ -154,12 +160,23 @@ class ImageFormer(Component):
             values["velocity_sigma"][m] = np.hypot(
                 self.velocity_sigma[m], focus.sigma if focus.accepted else 0.0
             )
+        if not formed.any():
+            return
         noise = self.normals("slant_range", 1)[:, 0]
         values["slant_range"] = beam_range + self.range_sigma * noise
         speed = np.linalg.norm(self.prior.v_e, axis=1)
         values["sine"] = wavelength * beam_doppler / (2 * speed)
         self.images = np.stack(chips)
-        self.image.publish(t, valid=fresh, **values)
+        self.image.publish(t, valid=formed, **values)
+
+    def _refuse(self, m: int, error: ValueError) -> None:
+        """Fail a member whose estimate leads to no image; the others have theirs."""
+        lines, cells = self.echo.shape
+        self.fail(
+            np.arange(self.n_members) == m,
+            f"cannot form an image of {lines} lines of {cells} cells: {error}; receive more lines "
+            f"or cells, or set {self.name}.rows and {self.name}.columns",
+        )
 
     @property
     def _looks(self) -> tuple[int, int]:
@@ -176,18 +193,14 @@ class ImageFormer(Component):
         column = multilook_index(center[1] - columns.start, self.range_looks)
         return rows, columns, (float(row), float(column))
 
-    def _expected_velocity(self, wavelength: float) -> tuple[FloatArray, FloatArray]:
-        """Effective velocity that each estimate implies, and its growth with range."""
-        r, v = self.prior.r_e, self.prior.v_e
-        speed = np.linalg.norm(v, axis=1)
-        beam_range = np.where(self.acquired.fresh, self.acquired.beam_range, np.nan)
-        sine = wavelength * self.acquired.beam_doppler / (2 * speed)
-        found = np.full((3, self.n_members), np.nan)
-        use = self.acquired.fresh & self.environment.active
-        for i, offset in enumerate((0.0, -_HALF_SWATH, _HALF_SWATH)):
-            p = ground_point(r[use], v[use], beam_range[use] + offset, sine[use])
-            found[i, use] = effective_velocity_array(r[use], v[use], p)
-        return found[0], (found[2] - found[1]) / (2 * _HALF_SWATH)
+    def _expected_velocity(self, m: int, wavelength: float) -> tuple[float, float]:
+        """Effective velocity that a member's estimate implies, and its growth with range."""
+        r, v = self.prior.r_e[m], self.prior.v_e[m]
+        sine = wavelength * self.acquired.beam_doppler[m] / (2 * np.linalg.norm(v))
+        ranges = self.acquired.beam_range[m] + np.array([0.0, -_HALF_SWATH, _HALF_SWATH])
+        p = ground_point(r, v, ranges, sine)
+        own, near, far = (float(x) for x in effective_velocity_array(r, v, p))
+        return own, (far - near) / (2 * _HALF_SWATH)
 
     def _expected_centroid(self, wavelength: float) -> tuple[FloatArray, FloatArray]:
         """Doppler centroid that each estimate implies, and its standard deviation."""

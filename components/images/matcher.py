@@ -86,7 +86,11 @@ class ImageMatcher(Component):
             self.match_sigma[m] = match.sigma.max() if match.accepted else np.nan
             self.match_place[m] = match.row, match.column
             if match.accepted:
-                places[m] = reference.place(match.row, match.column)
+                try:
+                    places[m] = self._placed(reference, dem, match)
+                except ValueError as error:
+                    self.fail(np.arange(self.n_members) == m, f"cannot place its image: {error}")
+                    continue
                 valid[m] = True
         first = next(iter(found.values()))
         self.inliers = first.inliers
@@ -96,13 +100,12 @@ class ImageMatcher(Component):
         if not valid.any():
             self._require_coverage(reference, fresh)
             return
-        self._publish(t, places, valid, dem)
+        self._publish(t, places, valid)
 
-    def _publish(self, t: float, places: FloatArray, valid: Mask, dem: Dem) -> None:
+    def _publish(self, t: float, places: FloatArray, valid: Mask) -> None:
         n = self.n_members
         r_f_e, D = np.zeros((n, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
-        latitude, longitude = places[valid, 0], places[valid, 1]
-        r_f_e[valid] = ecef(latitude, longitude, dem.at(latitude, longitude))
+        r_f_e[valid] = ecef(*places[valid].T)
         axes = track_axes(r_f_e[valid], self.prior.v_e[valid])
         variance = self.geolocation_sigma[valid] ** 2
         D[valid] = np.einsum("nki,nk,nkj->nij", axes, variance, axes)
@@ -111,6 +114,11 @@ class ImageMatcher(Component):
         R[:, 2, 2], R[:, 3, 3] = self.range_sigma**2, self.image.velocity_sigma**2
         present[:, 3] = self.image.focused
         self.fix.publish(t, valid=valid, y=y, r_f_e=r_f_e, R=R, D=D, present=present)
+
+    def _placed(self, reference: Reference, dem: Dem, match: Match) -> tuple[float, float, float]:
+        """Latitude, longitude [rad] and height of the terrain [m] where an image lies."""
+        latitude, longitude, _ = reference.place(match.row, match.column)
+        return float(latitude), float(longitude), float(dem.at(latitude, longitude))
 
     def _dem(self) -> Dem:
         return dem_from(self.height, self.grid)
@@ -142,7 +150,10 @@ class ImageMatcher(Component):
     def _require_coverage(self, reference: Reference, fresh: Mask) -> None:
         """Raise where nothing was recognized because the reference is of another place."""
         r, v, P = (getattr(self.prior, k)[fresh] for k in ("r_e", "v_e", "P"))
-        p = ground_point(r, v, self.image.slant_range[fresh], self.image.sine[fresh])
+        try:
+            p = ground_point(r, v, self.image.slant_range[fresh], self.image.sine[fresh])
+        except ValueError:  # an estimate that sees no ground says nothing of the reference
+            return
         latitude, longitude, _ = geodetic(p)
         longitude = reference.own_turn(longitude)
         sigma = np.sqrt(np.trace(P[:, :3, :3], axis1=1, axis2=2))

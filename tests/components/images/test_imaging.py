@@ -216,7 +216,7 @@ def test_too_little_memory_is_said_before_it_starts():
 
 def test_a_scene_too_small_for_the_aperture_is_refused():
     text = failure(lambda: small(("echo.n_lines", "2500")))
-    assert "'former' cannot form an image of 2500 lines of 560 cells" in text
+    assert "'former': cannot form an image of 2500 lines of 560 cells" in text
     assert "the scene is too small: no line is seen by the beam" in text
     assert "receive more lines or cells" in text
 
@@ -407,3 +407,19 @@ def test_a_recording_of_speckle_is_not_believed(tmp_path):
 
 def test_flat_ground_serves_the_real_echo():
     assert float(flat_dem().at(0.86, -2.15)) == 0.0
+
+
+def test_a_member_that_cannot_form_an_image_fails_alone(flown):
+    """Its estimate is far in space, from where this range reaches no ground: others go on."""
+    system = small()
+    sigma = np.array([[1000.0] * 3, [2e8] * 3])
+    system.disperse(Dispersion("lost", ("last_known.position_sigma",), sigma, kind="list"))
+    result = simulate(system, members=3, duration="9")
+    (failure,) = result.excluded
+    assert (failure["member"], failure["component"]) == (1, "former")
+    assert failure["t_s"] == pytest.approx(8.2)
+    assert failure["reason"].startswith("cannot form an image of 4200 lines of 560 cells: ")
+    for name in ("matcher.fix.y", "correct.estimate.r_e"):
+        for member in (0, 2):
+            found, alone = (at_fix(d, name)[member] for d in (result.dataset, flown))
+            np.testing.assert_array_equal(found, alone)
