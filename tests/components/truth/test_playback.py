@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from terrafix.components.truth.playback import Recording
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.files.readers import read_system
@@ -342,3 +343,13 @@ def test_the_real_orbit_of_sentinel_1_is_flown():
     time = str(truth.dims[0])
     np.testing.assert_array_equal(truth.sel({time: 4.0, "member": 0}), ephemeris.r_e[row])
     assert not result.excluded
+
+
+def test_members_are_looked_up_by_their_number():
+    """Of a recording of members 9, 2 and 5, in this order, each gets its own samples."""
+    recording = Recording.__new__(Recording)
+    recording.members = np.array([9, 2, 5])
+    values = np.array([[[90.0], [20.0], [50.0]]])
+    recording.samples = {"r_e": (np.zeros(1), values)}
+    recording.choose(np.array([2, 9, 5]))
+    np.testing.assert_array_equal(recording.samples["r_e"][1][0, :, 0], [20.0, 90.0, 50.0])

@@ -61,3 +61,48 @@ def test_the_first_residual_and_nis_are_those_of_the_textbook():
     expected = np.array([miss, 0.3])
     np.testing.assert_allclose(residual, expected, atol=1e-12)
     assert nis == pytest.approx(expected @ np.linalg.solve(S, expected), rel=1e-10)
+
+
+def test_five_iterations_are_made_towards_the_most_probable_state():
+    """Against Gauss-Newton in numbers: the fifth step's state, not that of the second.
+
+    The prior is five times as uncertain as above, so that a step is worth a factor of ten or so.
+    """
+    P0, R = 25 * P, np.diag(SIGMA**2)
+
+    def h(e):
+        at = PLACE + e
+        return np.array([np.arctan2(at[1], at[0]), np.hypot(*at)])
+
+    def jacobian(e):
+        a, b = PLACE + e
+        rho = np.hypot(a, b)
+        return np.array([[-b / rho**2, a / rho**2], [a / rho, b / rho]])
+
+    y = h(np.zeros(2)) + np.array([0.25, 3.0])
+    e, steps = np.zeros(2), []
+    for _ in range(60):
+        H = jacobian(e)
+        K = P0 @ H.T @ np.linalg.inv(H @ P0 @ H.T + R)
+        e = K @ (y - h(e) + H @ e)
+        steps.append(e)
+    error = ca.SX.sym("error", 2)
+    at = PLACE + error
+    predicted = ca.vertcat(ca.atan2(at[1], at[0]), ca.sqrt(ca.dot(at, at)))
+    measurement = Measurement(
+        ca.DM(y),
+        lambda value: ca.substitute(predicted, error, value),
+        lambda value: ca.substitute(ca.jacobian(predicted, error), error, value),
+        lambda _: ca.DM(R),
+        ca.DM([1.0, 1.0]),
+        angles=(0,),
+    )
+    done = update_rule("iterated")(ca.SX(ca.DM(P0)), measurement, 0.0)
+    values = ca.Function("f", [], [done.correction, done.P])()
+    np.testing.assert_allclose(np.asarray(values["o0"]).ravel(), steps[4], atol=1e-10)
+    assert np.linalg.norm(steps[1] - steps[4]) > 1e-4  # what two iterations would leave [m]
+    assert np.linalg.norm(steps[4] - e) < 1e-5
+    H = jacobian(steps[4])
+    K = P0 @ H.T @ np.linalg.inv(H @ P0 @ H.T + R)
+    after = (np.eye(2) - K @ H) @ P0
+    np.testing.assert_allclose(np.asarray(values["o1"]), after, rtol=1e-8)

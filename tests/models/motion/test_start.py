@@ -85,3 +85,13 @@ def test_pass_geometry(constants, start_i, time, satellite, pixel, slant, incide
 def test_a_place_out_of_reach_is_refused():
     with pytest.raises(ValueError, match=r"latitude 89.9000.*out of reach at inclination 98.16"):
         boresight_start(ALOS, np.radians(89.9), 0.0, LOOK)
+
+
+@pytest.mark.parametrize("longitude", [180.0, 179.999, -179.999, 185.0, -540.0, 359.0])
+def test_a_start_is_found_about_the_date_line_too(longitude):
+    """The boresight meets the place: the same point on Earth, whatever turn it is counted in."""
+    r, v = boresight_start(ALOS, np.radians(20.0), np.radians(longitude), LOOK)
+    r_e, v_e = earth_fixed_from_inertial_array(r, v, 0.0, EARTH.rotation_rate)
+    found = degrees(view(r_e, v_e)[0])
+    assert found[0] == pytest.approx(20.0, abs=1e-9)
+    assert (found[1] - longitude + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-9)

@@ -56,6 +56,9 @@ def test_candidates_of_the_centroid_are_those_that_geometry_allows():
     assert centroid_candidates(100.0, 1000.0, 150.0, 50.0) == [100.0]
     assert centroid_candidates(100.0, 1000.0, 700.0, 250.0) == [1100.0, 100.0]
     assert centroid_candidates(-400.0, 1000.0, 80.0, 1.0) == [-400.0]  # never empty
+    # 3.5 sigma either way: 1400 Hz about 600 Hz hold three, 1607 Hz a fourth
+    assert centroid_candidates(0.0, 1000.0, 600.0, 400.0) == [1000.0, 0.0, 2000.0]
+    assert centroid_candidates(0.0, 1000.0, 600.0, 459.0) == [1000.0, 0.0, 2000.0, -1000.0]
 
 
 @pytest.fixture(scope="module")

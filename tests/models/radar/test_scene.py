@@ -41,3 +41,17 @@ def test_a_scene_next_to_the_pole_is_refused_by_name():
     width = round(10e3 / (6371e3 * np.cos(np.radians(89.9))) / CELL)
     with pytest.raises(ValueError, match=r"about latitude 89.90 deg takes 51\d\d\d\d cells"):
         SCENE.texture(rows, range(width))
+
+
+def test_bright_points_are_as_bright_and_as_many_as_they_are_said_to_be():
+    """Median 25 dB, 4 dB rms, 3 a square kilometer: each within 5 of its own standard errors."""
+    scene = Scene(flat_dem(0.0), seed=2, points_per_km2=3.0, points_db=25.0)
+    side = 3000  # cells of 1e-4 deg
+    latitude, _, amplitude, phase = scene.points(range(-side // 2, side // 2), range(side))
+    n = len(latitude)
+    area = (side * CELL * 6371.0) ** 2  # [km^2], at the equator
+    assert n == pytest.approx(3.0 * area, abs=5 * np.sqrt(3.0 * area))
+    db = 20 * np.log10(amplitude)
+    assert db.std() == pytest.approx(4.0, abs=5 * 4.0 / np.sqrt(2 * n))
+    assert db.mean() == pytest.approx(25.0, abs=5 * 4.0 / np.sqrt(n))
+    assert phase.mean() == pytest.approx(0.5, abs=5 / np.sqrt(12 * n))

@@ -244,3 +244,36 @@ def test_unknown_boresight_is_refused():
 def test_an_unknown_element_is_refused():
     with pytest.raises(ValueError, match=r"in_track must be one of .*got 'ground'"):
         sar_measurement_model("ground")
+
+
+def test_the_scale_of_errors_is_that_of_every_random_error():
+    """Twice the scale, twice the error of range, speed and place; not of what the fix states."""
+    start = {
+        "r_e": [-1104646.34, -6096830.39, 3395727.38],
+        "v_e": [-1004.69, 3810.14, 6497.94],
+        "q_be": [-0.59547836, -0.62105225, -0.42482638, 0.28146433],
+        "q_mu": [0.0, 0.0, 0.0, 1.0],
+        "look": np.radians(34.3),
+        "radius": 6378137.0,
+        "flattening": 1 / 298.257223563,
+        "range_sigma": 3.0,
+        "speed_sigma": 0.5,
+        "geolocation_sigma": [8.0, 5.0, 2.0],
+        "geolocation_bias": [10.0, 20.0, 30.0],
+        "range_noise": 0.7,
+        "speed_noise": -1.2,
+        "geolocation_noise": [1.0, -2.0, 0.5],
+    }
+    model = synthetic_fix_model()
+    none, one, two = (model(**start, error_scale=s) for s in (0.0, 1.0, 2.0))
+    for scale, fix in ((1.0, one), (2.0, two)):
+        moved = fix["fix.r_f_e"] - none["fix.r_f_e"]
+        np.testing.assert_allclose(moved, scale * np.array([8.0, -10.0, 1.0]), atol=1e-8)
+        error = fix["fix.y"] - none["fix.y"]
+        np.testing.assert_allclose(error, [0, 0, scale * 2.1, scale * -0.6], atol=1e-8)
+        np.testing.assert_array_equal(fix["fix.R"], none["fix.R"])
+        np.testing.assert_array_equal(fix["fix.D"], none["fix.D"])
+    np.testing.assert_allclose(np.diag(one["fix.R"]), [0, 0, 9.0, 0.25])
+    np.testing.assert_allclose(np.diag(one["fix.D"]), [64.0, 25.0, 4.0])
+    unbiased = model(**start | {"geolocation_bias": [0.0] * 3}, error_scale=1.0)
+    np.testing.assert_allclose(one["fix.r_f_e"] - unbiased["fix.r_f_e"], [10, 20, 30], atol=1e-8)
