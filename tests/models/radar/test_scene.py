@@ -51,6 +51,9 @@ def test_bright_points_are_as_bright_and_as_many_as_they_are_said_to_be():
     n = len(latitude)
     area = (side * CELL * 6371.0) ** 2  # [km^2], at the equator
     assert n == pytest.approx(3.0 * area, abs=5 * np.sqrt(3.0 * area))
+    north = range(600_000, 600_000 + side)  # at 60 deg cells are half as wide
+    halved = 3.0 * area * np.cos(np.radians(60.0 + side * 1e-4 / 2))
+    assert len(scene.points(north, range(side))[0]) == pytest.approx(halved, abs=0.1 * halved)
     db = 20 * np.log10(amplitude)
     assert db.std() == pytest.approx(4.0, abs=5 * 4.0 / np.sqrt(2 * n))
     assert db.mean() == pytest.approx(25.0, abs=5 * 4.0 / np.sqrt(n))
