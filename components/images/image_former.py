@@ -127,7 +127,7 @@ class ImageFormer(Component):
         known: dict[tuple[Processing, float], int] = {}
         values = {name: np.zeros(self.n_members) for name in IMAGE}
         formed = np.zeros(self.n_members, np.bool_)
-        for m in np.flatnonzero(fresh):
+        for m in map(int, np.flatnonzero(fresh)):
             beam = float(beam_range[m]), float(beam_doppler[m])
             try:
                 velocity, slope = self._expected_velocity(m, wavelength)
