@@ -69,6 +69,7 @@ class EarlierPass(_Reference):
         [0.0, 300.0, 150.0],
         shape=(3,),
         unit="m",
+        frame="track",
         doc="of the earlier orbit: along the track, to the right, up",
     )
     n_lines = Count(4800, minimum=200, doc="lines of the reference, before averaging")

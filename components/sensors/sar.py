@@ -22,7 +22,9 @@ class AntennaMount(NoisyComponent):
 
     default_rate = Rate(hz=100)
 
-    misalignment = Parameter(0.0, shape=(3,), unit="rad", doc="mean at t = 0, rotation vector")
+    misalignment = Parameter(
+        0.0, shape=(3,), unit="rad", frame="s", doc="mean at t = 0, rotation vector"
+    )
     misalignment_sigma0 = Parameter(0.0, unit="rad", minimum=0.0, doc="drawn at t = 0, per axis")
     misalignment_walk = Parameter(0.0, unit="rad/s^0.5", minimum=0.0, doc="random walk, per axis")
 
@@ -55,7 +57,11 @@ class SyntheticSarFix(NoisyComponent):
         5.0, shape=(3,), unit="m", positive=True, doc="error of the geocoded pixel, Earth-fixed"
     )
     geolocation_bias = Parameter(
-        0.0, shape=(3,), unit="m", doc="constant error of the geocoded pixel, not reported"
+        0.0,
+        shape=(3,),
+        unit="m",
+        frame="e",
+        doc="constant error of the geocoded pixel, not reported",
     )
     error_scale = Parameter(
         1.0, minimum=0.0, doc="size of the random errors relative to what the fix reports"

@@ -30,8 +30,8 @@ class OrbitTruth(SymbolicComponent):
 
     gravity = Choice(GRAVITY_MODELS, "j2", doc="gravity field")
     drag = Flag(False, doc="add drag of an atmosphere of the given density")
-    r0_i = Parameter(shape=(3,), unit="m", doc="position at t = 0, inertial")
-    v0_i = Parameter(shape=(3,), unit="m/s", doc="velocity at t = 0, inertial")
+    r0_i = Parameter(shape=(3,), unit="m", frame="i", doc="position at t = 0, inertial")
+    v0_i = Parameter(shape=(3,), unit="m/s", frame="i", doc="velocity at t = 0, inertial")
     mu = Parameter(EARTH.mu, unit="m^3/s^2", positive=True, doc="gravitational parameter")
     radius = Parameter(EARTH.radius, unit="m", positive=True, doc="equatorial radius")
     j2 = Parameter(EARTH.j2, doc="second zonal coefficient")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from rich import box
@@ -13,7 +12,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from terrafix.cosim.campaign.outcome import Outcome
+from terrafix.cosim.campaign.outcome import Outcome, command
 from terrafix.cosim.campaign.statistics.ensemble import facts_of
 from terrafix.cosim.campaign.statistics.moments import EndRow, end_rows
 from terrafix.cosim.campaign.verdict import Verdict
@@ -25,11 +24,18 @@ WIDTH, ROWS, EVALUATIONS = 100, 15, 3
 """Of what is shown at a prompt: characters, rows of tables, evaluation components."""
 
 
-def campaign_tables(result: Outcome, system: str) -> list[Any]:
-    """What a person wants to know of a campaign, as rich renderables in the order of reading."""
+def campaign_tables(
+    result: Outcome, system: str, settings: Sequence[tuple[str, str]] = ()
+) -> list[Any]:
+    """What a person wants to know of a campaign, as rich renderables in the order of reading.
+
+    `system` and `settings` are the file and what was set, to be repeated.
+    """
     shown = overview(result)
-    repeat = f"terrafix campaign {shlex.quote(system)} --runs {result.runs} --seed {result.seed}"
-    shown.append(Text(f"repeat any run alone: {repeat} --member K --out member.nc", style="dim"))
+    repeat = command(system, settings, runs=result.runs, seed=result.seed, duration=result.duration)
+    whole = {"no_wrap": True, "overflow": "ignore"}  # a line to copy
+    text = f"repeat any run alone: {repeat} --member K --out member.nc"
+    shown.append(Text(text, style="dim", **whole))
     if result.out is not None:
         shown.append(Text(f"wrote {result.out}; terrafix report {result.out}", style="dim"))
     return shown

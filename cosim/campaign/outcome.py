@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from terrafix.cosim.basics.clock import text_seconds
 from terrafix.cosim.campaign.batch import BlockResult
 from terrafix.cosim.campaign.statistics.ensemble import Statistics
 from terrafix.cosim.campaign.statistics.statistic import BLOCK, SHOWN
@@ -80,3 +83,22 @@ class Outcome:
                 self.parameters[name] = np.concatenate([*before, values])
         kinds = {k for k in [*self.kernel.split("+"), *block.kernel.split("+")] if k}
         self.kernel = "+".join(sorted(kinds))
+
+
+def command(
+    system: str,
+    settings: Iterable[tuple[str, str]],
+    *,
+    runs: int,
+    seed: int,
+    duration: Fraction,
+) -> str:
+    """The command that flies a campaign again, for a shell: of all that was said, nothing left out.
+
+    The duration is among it, for the file's may change.
+    """
+    words = ["terrafix", "campaign", system]
+    for name, value in settings:
+        words += ["--set", f"{name}={value}"]
+    words += ["--runs", str(runs), "--seed", str(seed), "--duration", text_seconds(duration)]
+    return shlex.join(words)

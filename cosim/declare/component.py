@@ -31,7 +31,7 @@ from terrafix.cosim.declare.ports import Capabilities, Declaration, Port, State
 from terrafix.cosim.show.tables import Block, Shown
 
 ATTRIBUTES = frozenset(
-    {"name", "rate", "ports", "step_index", "kernel", "call", "messages"}
+    {"name", "doc", "rate", "ports", "step_index", "kernel", "call", "messages"}
 )  # of every component
 KEYS = frozenset({"type", "period", "offset", "times", "doc"})  # of its table in a file
 
@@ -153,6 +153,8 @@ class Component(Shown):
 
     Attributes
     ----------
+    doc : str
+        What it is for in its system.
     declarations : dict of str to Declaration
         Of the class: ports, states and parameters.
     ports : dict of str to Port
@@ -194,7 +196,7 @@ class Component(Shown):
         cls.__doc__ = _Documentation(vars(cls).get("__doc__"))  # type: ignore[assignment]
 
     def __init__(self, *, rate: Rate | None = None, **settings: object) -> None:
-        self.name = ""
+        self.name = self.doc = ""
         self.rate = rate or self.default_rate
         if self.rate is not None and not isinstance(self.rate, Rate):
             raise RateError(

@@ -96,6 +96,9 @@ class Parameter(Setting[FloatArray]):
         Of one member.
     unit : str or tuple of str
         SI; other units of the same dimension are converted when set.
+    frame : str, optional
+        Of a vector. One number stands for all elements of a vector without a frame (a sigma per
+        axis); in a frame it would be a direction that nobody meant, and only zero is taken.
     minimum, maximum : float, optional
         Inclusive bounds in `unit`.
     positive : bool
@@ -110,6 +113,7 @@ class Parameter(Setting[FloatArray]):
         *,
         shape: Sequence[int] = (),
         unit: Unit = "1",
+        frame: str | None = None,
         minimum: float | None = None,
         maximum: float | None = None,
         positive: bool = False,
@@ -119,6 +123,7 @@ class Parameter(Setting[FloatArray]):
         super().__init__(default, doc=doc)
         self.shape = tuple(shape)
         self.unit = unit
+        self.frame = frame
         self.minimum, self.maximum = minimum, maximum
         self.positive, self.infinite = positive, infinite
 
@@ -132,6 +137,8 @@ class Parameter(Setting[FloatArray]):
             given.append(f"shape={self.shape}")
         if self.unit != "1":
             given.append(f"unit={quoted(self.unit)}")
+        if self.frame is not None:
+            given.append(f"frame={quoted(self.frame)}")
         bounds = {"minimum": self.minimum, "maximum": self.maximum}
         given += [f"{n}={v}" for n, v in bounds.items() if v is not None]
         return given + [f"{n}=True" for n in ("positive", "infinite") if getattr(self, n)]
@@ -175,14 +182,20 @@ class Parameter(Setting[FloatArray]):
             raise ConfigurationError(f"{where} is {shown(value)}; {self._wanted()}") from None
         self._check_finite(array, where)
         if array.shape != self.shape:
-            if array.ndim == 0 and self.shape and isinstance(self.unit, str):
-                array = np.full(self.shape, float(array))
-            else:
+            if array.ndim or not self._one_for_all(float(array)):
                 what = f"has shape {array.shape}" if array.ndim else "is one number"
-                raise ConfigurationError(f"{where} {what}; {self._wanted()}")
+                axes = (
+                    "" if self.frame is None else f"\n  one for each axis of frame '{self.frame}'"
+                )
+                raise ConfigurationError(f"{where} {what}; {self._wanted()}{axes}")
+            array = np.full(self.shape, float(array))
         array = self._convert(array, unit, where=where, bare=bare)
         self.check_range(array, where)
         return array
+
+    def _one_for_all(self, number: float) -> bool:
+        """Whether one number says what all elements are."""
+        return isinstance(self.unit, str) and (self.frame is None or number == 0.0)
 
     def _convert(
         self, array: FloatArray, unit: str | None, *, where: str, bare: bool

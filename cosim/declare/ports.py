@@ -125,6 +125,10 @@ class Port(Declaration, Generic[View_co]):
             if not self.fields or "" in self.fields:
                 raise ConfigurationError("a bundle needs named fields")
             for name, each in self.fields.items():
+                if not name.isidentifier():
+                    raise ConfigurationError(
+                        f"'{name}' cannot name a field: use letters, digits and underscores"
+                    )
                 if each.ragged or np.dtype(each.dtype) != np.float64:
                     raise ConfigurationError(f"field '{name}': bundles hold float64, not ragged")
         if ragged and not shape:

@@ -175,11 +175,6 @@ def _refuse_impossible(
 ) -> None:
     """Raise what can be known to be wrong before the first step."""
     master, base = simulation.master, simulation.plan.base
-    if master.ticks(length) == 0:
-        raise RateError(
-            f"duration is {text_seconds(length)} s, shorter than the base step of "
-            f"{text_seconds(base)} s\n  give a longer one"
-        )
     if master.ticks(length) > MAX_TICKS:
         raise RateError(
             f"duration is {text_seconds(length)} s at a base step of {text_seconds(base)} s: "

@@ -25,7 +25,7 @@ from terrafix.cosim.kernels.build import build_kernels
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.slots import SignalSlot
 from terrafix.cosim.records.recorder import Recorder, write_manifest
-from terrafix.cosim.system.check import Plan, check, record_rate
+from terrafix.cosim.system.check import Plan, check, check_duration, record_rate
 from terrafix.cosim.system.identity import configuration, difference
 from terrafix.cosim.system.system import System
 
@@ -84,6 +84,8 @@ class Simulation:
         self.system = system
         length = None if duration is None else seconds(duration, "duration")
         self.plan: Plan = check(system, duration=length)
+        if length is not None:
+            check_duration(length, self.plan.base)
         self.members = _member_numbers(system.members if members is None else members)
         self.seed = system.seed if seed is None else seed
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:

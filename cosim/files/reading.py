@@ -233,6 +233,7 @@ def _component(
     if load.attempt(system.add, made, name) is None:
         load.broken.add(name)
         return
+    made.doc = str(table.get("doc", ""))
     timing = {k: table[k] for k in TIMING if k in table}
     given = {k: v for k, v in table.items() if k not in (*TIMING, "type", "doc")}
     refused = 0
@@ -369,7 +370,7 @@ def _records(load: Load, system: System, tables: Mapping[str, dict[str, Any]]) -
                 '  write ports = ["orbit.r_e", ...]'
             )
         elif not load.is_lost(ports):
-            load.attempt(system.record, name, ports, rate=rate)
+            load.attempt(system.record, name, ports, rate=rate, doc=str(table.get("doc", "")))
 
 
 def _dispersions(load: Load, system: System, tables: Mapping[str, dict[str, Any]]) -> None:
@@ -402,6 +403,7 @@ def _dispersions(load: Load, system: System, tables: Mapping[str, dict[str, Any]
                 kind=kind,
                 design=str(table.get("design", "random")),
                 limit=3.0 if limit is None else limit,
+                doc=str(table.get("doc", "")),
             )
             load.attempt(system.disperse, dispersion)
             bare = f"dispersion.{name}.{spread}" in load.bare

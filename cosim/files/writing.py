@@ -82,8 +82,7 @@ def _content(system: System) -> dict[str, Any]:
     """What a file says of a system: values, and tables of them, in plain types."""
     flat = system.flatten()
     content: dict[str, Any] = {"schema": SCHEMA, "name": system.name}
-    if system.doc:
-        content["doc"] = system.doc
+    content |= _doc(system.doc)
     if system.duration is not None:
         content["duration"] = f"{text_seconds(system.duration)} s"
     content |= {"members": system.members, "seed": system.seed}
@@ -103,10 +102,12 @@ def _content(system: System) -> dict[str, Any]:
     content["wiring"] = {"connect": connections} if connections else {}
     content["expose"] = {n: port(system.resolve(p)[0]) for n, p in system.exposed.items()}
     content["record"] = {
-        r.name: {"ports": [port(p) for p in r.ports]} | _timing(r.rate) for r in flat.records
+        r.name: _doc(r.doc) | {"ports": [port(p) for p in r.ports]} | _timing(r.rate)
+        for r in flat.records
     }
     content["dispersion"] = {
         d.name.replace(".", "_"): {
+            **_doc(d.doc),
             "kind": d.kind,
             **({"design": d.design} if d.design != "random" else {}),
             **({"limit": d.limit} if d.kind == "truncated" else {}),
@@ -139,7 +140,7 @@ def _component(path: str, component: Component, types: Mapping[str, str]) -> dic
             f"'{path}' is a {type(component).__name__}, which is no registered component type\n"
             "  register it in the entry-point group terrafix.components"
         )
-    table = {"type": types[kind]} | _timing(component.rate)
+    table = {"type": types[kind]} | _doc(component.doc) | _timing(component.rate)
     for name, setting in component.settings().items():
         value = component.setting(name) if name in component.given_parameters else None
         if value is not None:
@@ -147,6 +148,10 @@ def _component(path: str, component: Component, types: Mapping[str, str]) -> dic
                 value = value.absolute()
             table[name] = setting.write(value)
     return table
+
+
+def _doc(text: str) -> dict[str, Any]:
+    return {"doc": text} if text else {}
 
 
 def _timing(rate: Rate | None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError, TerrafixError
+from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError
 from terrafix.cosim.basics.files import writable_target
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ def rescue(folder: Path) -> Path | None:
     if any(folder.glob("*.npz")):
         try:
             write_netcdf(salvage(folder), target)
-        except TerrafixError:
+        except Exception:  # damaged in whatever way: it must not block this run
             folder.rename(aside)
             return aside
         shutil.rmtree(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,17 +62,23 @@ class _Labels:
         names: list[str] = []
         for axis, size in enumerate(shape):
             last = axis == len(shape) - 1
-            if last and field.labels:
-                name = "_".join(["axis", *field.labels])
-                if len(name) > LONGEST_NAME:
-                    name = f"axis_{field.labels[0]}_to_{field.labels[-1]}"
-                self.coordinates[name] = list(field.labels)
-            else:
-                name = f"dim_{size}"
+            name = self._of_labels(list(field.labels)) if last and field.labels else f"dim_{size}"
             while name in names:
                 name += "b"
             names.append(name)
         return names
+
+    def _of_labels(self, labels: list[str]) -> str:
+        """Name of the axis of these labels alone; NetCDF has no slash in names."""
+        name = "_".join(["axis", *labels])
+        if len(name) > LONGEST_NAME:
+            name = f"axis_{labels[0]}_to_{labels[-1]}"
+        name = plain = re.sub(r"[^\w.+-]", "_", name)
+        others = 1
+        while self.coordinates.setdefault(name, labels) != labels:
+            others += 1
+            name = f"{plain}_{others}"
+        return name
 
 
 def build_dataset(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import base64
 import io
-import shlex
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from terrafix.cosim.basics.clock import seconds
+from terrafix.cosim.campaign.outcome import command
 from terrafix.cosim.campaign.statistics.ensemble import facts_of
 from terrafix.cosim.campaign.statistics.moments import end_rows
 from terrafix.cosim.lincov.display import describe
@@ -148,7 +149,11 @@ def _command(campaign: Campaign) -> str:
     source = campaign.attribute("source")
     if not source:
         return ""
-    a = campaign.dataset.attrs
-    sets = "".join(f" --set {shlex.quote(f'{k}={v}')}" for k, v in source["settings"])
-    path = shlex.quote(source["path"])
-    return f"terrafix campaign {path}{sets} --runs {a['runs']} --seed {a['seed']}"
+    about = campaign.dataset.attrs
+    return command(
+        source["path"],
+        source["settings"],
+        runs=about["runs"],
+        seed=about["seed"],
+        duration=seconds(about["duration"]),
+    )

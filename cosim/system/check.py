@@ -238,6 +238,24 @@ def _same_records(flat: FlatSystem) -> Iterator[TerrafixError]:
         )
 
 
+def check_duration(duration: Fraction, base: Fraction) -> None:
+    """Raise RateError if a duration [s] is no whole number of base steps: it would be cut."""
+    whole = duration // base
+    if whole * base == duration:
+        return
+    near = f"{text_seconds((whole + 1) * base)} s"
+    if whole:
+        what, near = (
+            "which is no whole number of base steps",
+            f"{text_seconds(whole * base)} s or {near}",
+        )
+    else:
+        what = "shorter than the base step"
+    raise RateError(
+        f"duration is {text_seconds(duration)} s, {what} of {text_seconds(base)} s\n  give {near}"
+    )
+
+
 def record_rate(flat: FlatSystem, record: Record) -> Rate:
     """Rate of a recorder: its own, or that of the one component it watches.
 

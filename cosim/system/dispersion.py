@@ -68,6 +68,8 @@ class Dispersion:
         One of `DESIGNS`.
     limit : float
         Of a truncated draw, in sigma.
+    doc : str
+        What it stands for.
     """
 
     name: str
@@ -76,6 +78,7 @@ class Dispersion:
     kind: str = "normal"
     design: str = "random"
     limit: float = 3.0
+    doc: str = ""
 
     def below(self, prefix: str) -> Dispersion:
         """The same dispersion seen from a system that contains this one as `prefix`."""
@@ -145,7 +148,9 @@ class Dispersion:
             return setting
         state = component.declarations.get(name)
         if isinstance(state, State) and np.dtype(state.field.dtype) == np.float64:
-            return Parameter(shape=state.field.fixed_shape, unit=state.field.unit)
+            return Parameter(
+                shape=state.field.fixed_shape, unit=state.field.unit, frame=state.field.frame
+            )
         numeric = [n for n, s in settings.items() if isinstance(s, Parameter)]
         numeric += [n for n, d in component.declarations.items() if isinstance(d, State)]
         raise ConfigurationError(
@@ -168,7 +173,7 @@ class Dispersion:
                     f"{where} is {self.spread!r}, not a list of values\n"
                     '  write values = ["1 m", "2 m"]'
                 )
-            one = Parameter(shape=shape, unit=unit)
+            one = Parameter(shape=shape, unit=unit, frame=parameter.frame)
             if isinstance(self.spread, str):
                 whole = Parameter(shape=(self._count(where), *shape), unit=unit)
                 return whole.read(self.spread, where=where, bare=bare)

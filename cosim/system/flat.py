@@ -32,6 +32,7 @@ class Record:
     name: str
     ports: tuple[str, ...]
     rate: Rate | None = None
+    doc: str = ""
 
 
 @dataclass

@@ -11,7 +11,8 @@ The same object comes from a system file (`terrafix.read_system`); both roads ra
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, TypeAlias, TypeVar, overload
@@ -20,7 +21,7 @@ from terrafix.cosim.basics.clock import Exact, Rate, seconds
 from terrafix.cosim.basics.errors import (
     ConfigurationError,
     RateError,
-    TerrafixError,
+    SystemCheckError,
     WiringError,
     nearest,
 )
@@ -119,8 +120,12 @@ class System(Shown):
                     f"this {type(node).__name__} is '{node.name}' already; make another one"
                 )
             node.name = name
-            if not node.missing_settings():
-                node.prepare()
+            try:
+                if not node.missing_settings():
+                    node.prepare()
+            except BaseException:
+                node.name = ""
+                raise
         else:
             if self in node._systems():
                 raise ConfigurationError(f"system '{self.name}' cannot contain itself")
@@ -131,6 +136,15 @@ class System(Shown):
             node.name, node._contained = name, True
         self.nodes[name] = node
         return node
+
+    def _node(self, name: str) -> Component | System:
+        """What has a name here; ConfigurationError if nothing has."""
+        if name not in self.nodes:
+            raise ConfigurationError(
+                f"system '{self.name}' has no component '{name}'\n"
+                f"  {nearest(name, self.nodes, what='components')}"
+            )
+        return self.nodes[name]
 
     def __getitem__(self, name: str) -> Component | System | PortRef:
         """Name an exposed port, a component, or a port of one.
@@ -170,6 +184,10 @@ class System(Shown):
     def expose(self, name: str, port: End) -> None:
         """Make a port of a component a port of this system."""
         _checked_name(name, "port")
+        if name in self.exposed:
+            raise ConfigurationError(
+                f"system '{self.name}' exposes '{self.exposed[name]}' as '{name}' already"
+            )
         path = self._path(port)
         self.resolve(path)
         self.exposed[name] = path
@@ -224,6 +242,7 @@ class System(Shown):
         *,
         period: Exact | None = None,
         rate: Rate | None = None,
+        doc: str = "",
     ) -> None:
         """Record ports at a period or rate, or whenever their one component steps."""
         _checked_name(name, "record")
@@ -235,7 +254,7 @@ class System(Shown):
         paths = tuple(self._path(p) for p in listed)
         if not paths:
             raise ConfigurationError(f"record '{name}' names no ports")
-        self.records.append(Record(name, paths, rate))
+        self.records.append(Record(name, paths, rate, doc))
 
     def disperse(self, dispersion: Dispersion) -> None:
         """Add a dispersion of parameters."""
@@ -246,21 +265,21 @@ class System(Shown):
         self.dispersions.append(dispersion)
 
     def remove(self, name: str) -> None:
-        """Remove a component with its connections (to put another in its place)."""
-        if name not in self.nodes:
-            raise ConfigurationError(
-                f"system '{self.name}' has no component '{name}'\n"
-                f"  {nearest(name, self.nodes, what='components')}"
-            )
-        node = self.nodes.pop(name)
-        if isinstance(node, Component):
-            node.name = ""
-        else:
-            node._contained = False
-        self.connections = [
-            c
-            for c in self.connections
-            if name not in (c.source.split(".")[0], c.target.split(".")[0])
+        """Remove a component with all that names it; `replace` puts another in its place.
+
+        Its connections go, its exposed ports, and what of it is recorded and dispersed.
+        """
+        _free(self._node(name))
+        del self.nodes[name]
+
+        def others(paths: Iterable[str]) -> tuple[str, ...]:
+            return tuple(path for path in paths if path.split(".")[0] != name)
+
+        self.connections = [c for c in self.connections if len(others((c.source, c.target))) == 2]
+        self.exposed = {port: path for port, path in self.exposed.items() if others([path])}
+        self.records = [replace(r, ports=left) for r in self.records if (left := others(r.ports))]
+        self.dispersions = [
+            replace(d, targets=left) for d in self.dispersions if (left := others(d.targets))
         ]
 
     def _all_nodes(self, prefix: str = "") -> Iterator[tuple[str, Component | System]]:
@@ -281,17 +300,19 @@ class System(Shown):
         """Put another component in the place of one, on the same ports, and return it.
 
         What the old one read is connected where the new one has that input too; everything that
-        others read from it must be there.
+        others read from it, and what is exposed or recorded, must be there.
 
         Raises
         ------
         ConfigurationError
             If there is no such component.
         WiringError
-            If a port that is read is missing or does not fit.
+            If a port that is read is missing or does not fit; all is then as it was.
         """
-        nodes, connections = Nodes(self.nodes), list(self.connections)
-        self.remove(name)
+        old = self._node(name)
+        nodes, connections = self.nodes, self.connections
+        called = node.name if isinstance(node, System) else ""
+        self.nodes = Nodes({n: each for n, each in nodes.items() if n != name})
         try:
             self.add(node, name)
             self.connections = []
@@ -300,13 +321,15 @@ class System(Shown):
                 if owner == name and isinstance(node, Component) and port not in node.inputs():
                     continue
                 self.connect(c.source, c.target, delay=c.delay)
-        except TerrafixError:
-            if isinstance(node, Component):
-                node.name = ""
+            for path in [*self.exposed.values(), *(p for r in self.records for p in r.ports)]:
+                self.resolve(path)
+        except BaseException:
+            if name in self.nodes:
+                _free(node, called)
             self.nodes, self.connections = nodes, connections
-            if isinstance(old := nodes[name], Component):
-                old.name = name
             raise
+        _free(old)
+        self.nodes = Nodes({n: self.nodes[n] for n in nodes})  # each in its place
         return node
 
     def _path(self, port: End) -> str:
@@ -370,7 +393,7 @@ class System(Shown):
             except WiringError:
                 return path
 
-        return Record(record.name, tuple(leaf(p) for p in record.ports), record.rate)
+        return replace(record, ports=tuple(leaf(p) for p in record.ports))
 
     def check(self, duration: Exact | None = None, *, outside: bool = False) -> Plan:
         """Check the system whole, and give what it comes down to: order, base step, notes.
@@ -388,10 +411,16 @@ class System(Shown):
         SystemCheckError
             With every problem found.
         """
-        from terrafix.cosim.system.check import check
+        from terrafix.cosim.system.check import check, check_duration
 
         length = self.duration if duration is None else _positive(duration, "duration")
-        return check(self, duration=length, outside=outside)
+        plan = check(self, duration=length, outside=outside)
+        if length is not None:
+            try:
+                check_duration(length, plan.base)
+            except RateError as error:
+                raise SystemCheckError(self.name, [error]) from error
+        return plan
 
     @overload
     def graph(self, path: None = None) -> Diagram: ...
@@ -436,7 +465,7 @@ class System(Shown):
                 for c in inner.connections
             ]
             flat.records += [
-                Record(f"{name}_{r.name}", tuple(f"{name}.{p}" for p in r.ports), r.rate)
+                replace(r, name=f"{name}_{r.name}", ports=tuple(f"{name}.{p}" for p in r.ports))
                 for r in inner.records
             ]
             flat.dispersions += [d.below(name) for d in inner.dispersions]
@@ -447,6 +476,14 @@ class System(Shown):
         flat.records += [self._resolved(record) for record in self.records]
         flat.dispersions += self.dispersions
         return flat
+
+
+def _free(node: Component | System, name: str = "") -> None:
+    """Let go of what another system, or this one under another name, may take."""
+    if isinstance(node, Component):
+        node.name = name
+    else:
+        node.name, node._contained = name or node.name, False
 
 
 def _checked_name(name: str, what: str) -> str:

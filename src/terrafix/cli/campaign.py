@@ -89,7 +89,7 @@ def campaign(
     else:
         from terrafix.cosim.campaign.display import campaign_tables
 
-        show(*campaign_tables(result, system))
+        show(*campaign_tables(result, system, settings))
     return 0
 
 

@@ -20,6 +20,7 @@ seed = 7
 
 [component.a]
 type = "linear"
+doc = "what it is for, # and all"
 period = "1/30 s"
 offset = "1/60 s"
 factor = "2"
@@ -60,8 +61,10 @@ open = "b.x"
 result = "b.y"
 
 [record.out]
+doc = "to look at"
 ports = ["a.y", "b.y"]
 period = "1 s"
+offset = "0.5 s"
 """
 
 

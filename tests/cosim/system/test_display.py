@@ -118,6 +118,7 @@ def test_a_broken_system_is_shown_with_what_is_broken():
     system = whole()
     system.remove("part")
     system.connections.append(type(whole().connections[0])("gone.x", "last.nothing"))
+    system.record("all", ["gone.x"], period="0.5")
     shown = repr(system)
     assert "missing: 'gone.x', which 'gone.x -> last.nothing' names" in shown
     assert "missing: 'last.nothing', which" in shown

@@ -194,6 +194,91 @@ def test_a_component_that_does_not_fit_replaces_nothing(toys):
     check(system)
 
 
+def nested(toys, part):
+    """A part whose port is read, exposed, recorded and dispersed, beside one that stays."""
+    system = toys.wire(
+        {"part": part, "spy": toys.EndSpy(), "other": toys.Clock()}, ["part.t -> spy.u"]
+    )
+    system.record("both", ["part.t", "other.t"])
+    system.record("part", ["part.t"])
+    system.expose("time", "part.t")
+    system.expose("spied", "spy.echo")
+    system.disperse(Dispersion("late", ("part.t0",), "1 s"))
+    return system
+
+
+class Late(Component):
+    """A clock that may start late."""
+
+    default_rate = Rate("1")
+    t0 = Parameter(0.0, unit="s")
+    t = Output(unit="s")
+
+    def _step_impl(self, t, dt):
+        self.t = t + self.t0
+
+
+def test_what_is_removed_is_gone_from_all_that_named_it(toys):
+    system = nested(toys, Late())
+    system.remove("part")
+    assert list(system.nodes) == ["spy", "other"]
+    assert system.connections == []
+    assert system.exposed == {"spied": "spy.echo"}
+    assert [(r.name, r.ports) for r in system.records] == [("both", ("other.t",))]
+    assert system.dispersions == []
+
+
+def test_what_replaces_stands_in_its_place(toys):
+    system = nested(toys, Late())
+    connections, exposed, records = system.connections, system.exposed, system.records
+    system.replace("part", Late(t0="5 s"))
+    assert list(system.nodes) == ["part", "spy", "other"]
+    assert (system.connections, system.exposed, system.records) == (connections, exposed, records)
+    assert len(system.dispersions) == 1
+    check(system)
+
+
+def test_what_does_not_fit_leaves_all_as_it_was(toys):
+    """A nested system, one whose exposed port is not there, and one that cannot be prepared."""
+    inner = System("inner")
+    inner.add(Late(), "clock")
+    inner.expose("t", "clock.t")
+    system = System("test")
+    system.add(inner, "part")
+    system.add(toys.EndSpy(), "spy")
+    system.expose("time", "part.t")
+    other = System("other_name")
+    other.add(Late(), "clock")
+    before = dict(system.nodes)
+    with pytest.raises(WiringError, match="exposes no port 't'"):  # but it is exposed on
+        system.replace("part", other)
+    assert dict(system.nodes) == before
+    assert (inner._contained, other._contained, other.name) == (True, False, "other_name")
+    with pytest.raises(ConfigurationError, match="part of a system already"):
+        System("third").add(inner, "taken")
+    other.expose("t", "clock.t")
+    system.replace("part", other)
+    System("third").add(inner, "free")
+
+    class Broken(Component):
+        def prepare(self):
+            raise ConfigurationError("no file")
+
+    broken, taken = Broken(), system.nodes["spy"]
+    with pytest.raises(ConfigurationError, match="no file"):
+        system.replace("part", broken)
+    assert broken.name == ""
+    with pytest.raises(ConfigurationError, match="this EndSpy is 'spy' already"):
+        system.replace("part", taken)
+    assert (taken.name, system.nodes["part"]) == ("spy", other)
+
+
+def test_a_port_is_exposed_under_one_name_once(toys):
+    system = nested(toys, Late())
+    with pytest.raises(ConfigurationError, match=r"exposes 'part\.t' as 'time' already"):
+        system.expose("time", "other.t")
+
+
 class Needy(Component):
     needed = Parameter(unit="m")
     u = Input((3,), unit="m", frame="e")

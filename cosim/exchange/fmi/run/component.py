@@ -177,7 +177,10 @@ class Fmu(Component):
                     f"  {nearest(name, known, what='it has')}"
                 )
             quantity = known[name]
-            reader = Parameter(shape=quantity.shape, unit=quantity.unit, infinite=True)
+            # nobody says what a foreign array's elements have in common
+            reader = Parameter(
+                shape=quantity.shape, unit=quantity.unit, frame="of the FMU", infinite=True
+            )
             values[name] = reader.read(value, where=f"'{self.name}.start.{name}'")
         return values
 
