@@ -13,7 +13,6 @@ that build the same library at the same time do not disturb one another.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import ctypes
 import functools
@@ -35,6 +34,7 @@ from typing import Protocol
 
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
 from terrafix.cosim.basics.machine import cpu_features
+from terrafix.cosim.basics.scratch import scratch, scratch_folder
 
 FLAGS = ("-O1", "-ftree-vectorize", "-fno-math-errno", "-ffp-contract=off")
 """No contraction, no reassociation: the virtual machine's bits.
@@ -93,7 +93,7 @@ class Compiler:
         CompilationError
             With the compiler's first complaint.
         """
-        with tempfile.TemporaryDirectory(prefix="terrafix-") as directory:
+        with scratch("compile") as directory:
             file, library = Path(directory, "kernel.c"), Path(directory, f"kernel{_SUFFIX}")
             file.write_text(source)
             command = [
@@ -384,6 +384,4 @@ def _open_kept(path: Path, key: str) -> ctypes.CDLL | None:
 @functools.cache
 def _session_directory() -> Path:
     """Directory of this process alone, removed at its end."""
-    directory = Path(tempfile.mkdtemp(prefix="terrafix-"))
-    atexit.register(shutil.rmtree, directory, ignore_errors=True)
-    return directory
+    return scratch_folder("kernels")

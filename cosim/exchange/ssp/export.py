@@ -6,7 +6,6 @@ exchange values after each step (all that SSP knows) see what is read at the end
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from terrafix.cosim.basics.clock import Rate, text_seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.files import writable_target
+from terrafix.cosim.basics.scratch import scratch
 from terrafix.cosim.basics.units import base_units
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.component import Fmu
@@ -108,8 +108,8 @@ def export_ssp(
         if plan.flat.owner(c.source) in paths and plan.flat.owner(c.target) in paths
     ]
     _refuse(system, plan, paths, leave_out)
-    with tempfile.TemporaryDirectory(prefix="terrafix-ssp-") as folder:
-        files = {p: _fmu(system, plan, p, Path(folder), platforms) for p in paths}
+    with scratch("ssp") as folder:
+        files = {p: _fmu(system, plan, p, folder, platforms) for p in paths}
         interfaces = {p: read_interface(open_archive(f)) for p, f in files.items()}
         writer = _Writer(system, plan, paths, connections, interfaces)
         content = {"SystemStructure.ssd": writer.document()}

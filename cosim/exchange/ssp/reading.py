@@ -7,9 +7,7 @@ components of their own; parameter sets become start values.
 
 from __future__ import annotations
 
-import atexit
 import shutil
-import tempfile
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +19,7 @@ from xml.etree import ElementTree as ET
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError, nearest
 from terrafix.cosim.basics.files import write_atomically
+from terrafix.cosim.basics.scratch import scratch_folder
 from terrafix.cosim.exchange.fmi.run.archive import checked_xml, unpack
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.ssp.linear import Linear
@@ -95,8 +94,7 @@ def read_ssp(
         raise ConfigurationError(f"there is no SSP package '{path}'")
     unpacked = folder
     if unpacked is None:
-        unpacked = Path(tempfile.mkdtemp(prefix="terrafix-ssp-"))
-        atexit.register(shutil.rmtree, unpacked, ignore_errors=True)
+        unpacked = scratch_folder("ssp")
     unpack(file, unpacked, "SSP package")
     document = unpacked / STRUCTURE
     if not document.is_file():

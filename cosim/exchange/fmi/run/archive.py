@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
 import shutil
 import stat
-import tempfile
 import zipfile
 import zlib
 from dataclasses import dataclass, field
@@ -14,6 +12,7 @@ from typing import Any
 from xml.parsers import expat
 
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.scratch import scratch_folder
 from terrafix.cosim.exchange.fmi.run.platforms import host_platform
 
 MOST_BYTES = 4 << 30
@@ -93,8 +92,7 @@ def open_archive(path: str | Path) -> Archive:
         raise ConfigurationError(f"'{path}' is a folder; name an .fmu file")
     key = (str(file.resolve()), status.st_mtime_ns, status.st_size)
     if key not in _opened:
-        folder = Path(tempfile.mkdtemp(prefix="terrafix-fmu-"))
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        folder = scratch_folder("fmu")
         try:
             unpack(file, folder)
             _opened[key] = _read(file, folder)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib.util
 import os
 import subprocess
-import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.machine import processors
+from terrafix.cosim.basics.scratch import scratch
 from terrafix.cosim.exchange.fmi.run.platforms import PLATFORMS, Platform, host_platform
 from terrafix.cosim.kernels.toolchain import FLAGS, working_compiler
 
@@ -68,10 +68,9 @@ def build(
     targets = [(p or host_platform(), _command(p)) for p in platforms]
     order = sorted(compiled, key=lambda name: -len(files[name]))  # the longest first
     with (
-        tempfile.TemporaryDirectory(prefix="terrafix-fmu-") as folder,
+        scratch("compile") as here,
         ThreadPoolExecutor(processors()) as pool,
     ):
-        here = Path(folder)
         for name, text in files.items():
             (here / name).write_text(text, encoding="utf-8")
         jobs = [(here, name, _flags(name, files[name]), *t) for name in order for t in targets]

@@ -1,0 +1,81 @@
+"""Folders of this process alone: gone when it ends, and gone after the next one if it was killed.
+
+All lie in one, ``terrafix-<random>`` among the system's temporary files, beside a lock that this
+process holds. Whoever makes one first removes those whose lock nobody holds any more.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import re
+import secrets
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
+_NAME = re.compile(r"terrafix-[0-9a-f]{16}\Z")
+
+
+def scratch_folder(what: str) -> Path:
+    """A new folder that is there until this process ends; `what` begins its name."""
+    return Path(tempfile.mkdtemp(prefix=f"{what}-", dir=_root()))
+
+
+@contextmanager
+def scratch(what: str) -> Iterator[Path]:
+    """A new folder for a ``with`` block."""
+    folder = scratch_folder(what)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@cache
+def _root() -> Path:
+    everybodys = Path(tempfile.gettempdir())
+    _sweep(everybodys)
+    folder = everybodys / f"terrafix-{secrets.token_hex(8)}"
+    lock = _lock(folder)
+    lock.acquire(blocking=False)
+    folder.mkdir(mode=0o700)
+    atexit.register(_leave, folder, lock, os.getpid())
+    return folder
+
+
+def _lock(folder: Path) -> BaseFileLock:
+    from filelock import FileLock
+
+    return FileLock(f"{folder}.lock", thread_local=False)
+
+
+def _sweep(everybodys: Path) -> None:
+    """Remove the folders of processes that were killed."""
+    from filelock import Timeout
+
+    for folder in everybodys.glob("terrafix-*"):
+        lock = _lock(folder)
+        with suppress(OSError, Timeout):  # another user's, or in use
+            if _NAME.match(folder.name) and os.access(folder, os.W_OK):
+                lock.acquire(blocking=False)
+                _remove(folder, lock)
+
+
+def _leave(folder: Path, lock: BaseFileLock, process: int) -> None:
+    if os.getpid() == process:  # a fork's end is not ours
+        _remove(folder, lock)
+
+
+def _remove(folder: Path, lock: BaseFileLock) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    with suppress(OSError):  # while it is held: a lock on a file that is gone is none
+        Path(lock.lock_file).unlink()
+    lock.release()
