@@ -33,6 +33,24 @@ class StepError(TerrafixError):
     """A component that failed while the simulation was running."""
 
 
+class ComponentError(StepError):
+    """What a component raised, with all members that it stepped.
+
+    Attributes
+    ----------
+    component : str
+        Its path.
+    tick : int
+    t_s : float
+    reason : str
+        What it raised, in one line or more.
+    """
+
+    def __init__(self, component: str, tick: int, t_s: float, reason: str) -> None:
+        super().__init__(f"'{component}' failed at t = {t_s:.9g} s (tick {tick})\n  {reason}")
+        self.component, self.tick, self.t_s, self.reason = component, tick, t_s, reason
+
+
 class SystemCheckError(TerrafixError):
     """Every problem found in one system, reported together.
 

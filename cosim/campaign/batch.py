@@ -18,10 +18,12 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.cosim.basics.errors import ConfigurationError, StepError
+from terrafix.cosim.basics.errors import ComponentError, ConfigurationError, StepError
 from terrafix.cosim.campaign.statistics.ensemble import STATISTICS, block_of
 from terrafix.cosim.campaign.statistics.statistic import BLOCK, Layout, Statistic, Sums
 from terrafix.cosim.declare.evaluation import Evaluation
+from terrafix.cosim.engine.apart import fly_apart, fly_part
+from terrafix.cosim.engine.flight import Flight
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.system import System
 
@@ -150,25 +152,10 @@ def fly_batch(task: Task, first: int, last: int) -> list[BlockResult]:
     ------
     ConfigurationError
         If the system cannot be flown at all.
-    StepError
-        If a component fails for every member by itself.
     """
     system = _system(task)
     members = np.arange(first, last)
     gc.collect()  # what earlier batches left in cycles: memory must not grow with their number
-    try:
-        return _blocks(*_fly(task, system, members))
-    except StepError:
-        pass  # of one member, perhaps: alone, the others are not held up
-    parts = [_fly(task, system, np.array([m]), alone=True) for m in members.tolist()]
-    return _blocks(*_joined(parts))
-
-
-_Flight = tuple[Task, Simulation, NDArray[np.int64], dict[str, dict[str, NDArray[Any]]], Any, Any]
-
-
-def _fly(task: Task, system: System, members: NDArray[np.int64], *, alone: bool = False) -> _Flight:
-    """Fly some members; histories by evaluation component, padded where nobody was left."""
     simulation = Simulation(
         system,
         members=members.tolist(),
@@ -178,31 +165,42 @@ def _fly(task: Task, system: System, members: NDArray[np.int64], *, alone: bool 
         recording=task.histories is not None,
     )
     try:
-        excluded = simulation.master.excluded
-        try:
-            simulation.initialize()
-            simulation.run_until(task.duration)
-        except StepError as error:
-            if simulation.master.active.any():  # a component failed, and not a member
-                if not alone:
-                    raise
-                excluded.append(
-                    {
-                        "member": int(members[0]),
-                        "component": "",
-                        "t_s": simulation.master.seconds(simulation.master.tick),
-                        "reason": str(error),
-                    }
-                )
+        flight = _fly(task, simulation)
         if task.histories is not None:
-            _write_histories(task, simulation, members)
-        histories = {
-            path: _padded(simulation.history(path), layout)
-            for path, layout in layouts(simulation, task.duration).items()
-        }
-        return task, simulation, members, histories, list(excluded), dict(simulation.parameters)
+            _write_histories(task, simulation, flight)
+        return _blocks(task, simulation, flight)
     finally:
         simulation.master.terminate()
+
+
+def _fly(task: Task, simulation: Simulation) -> Flight:
+    """Fly all members of a simulation; those for whom a component raises are given up."""
+    members = simulation.members
+
+    def part(some: NDArray[np.int64], until: int | None) -> Flight:
+        return fly_part(
+            simulation.system,
+            some,
+            until,
+            seed=task.seed,
+            duration=task.duration,
+            runs=task.runs,
+            recording=task.histories is not None,
+        )
+
+    try:
+        simulation.initialize()
+        simulation.run_until(task.duration)
+    except ComponentError as error:
+        if len(members) == 1:
+            simulation.master.give_up(error)
+            return simulation.flight()
+        simulation.master.terminate()  # its components fly again
+        return fly_apart(part, members, error, all_the_same=True)
+    except StepError:
+        if simulation.master.active.any():  # it was a recorder
+            raise
+    return simulation.flight()
 
 
 def _padded(
@@ -218,33 +216,10 @@ def _padded(
     }
 
 
-def _joined(parts: list[_Flight]) -> _Flight:
-    """Members that were flown one by one, side by side."""
-    task, simulation = parts[0][:2]
-    histories = {
-        path: {
-            name: np.concatenate([p[3][path][name] for p in parts], axis=1)
-            for name in parts[0][3][path]
-        }
-        for path in parts[0][3]
-    }
-    parameters = {
-        name: (unit, np.concatenate([p[5][name][1] for p in parts]))
-        for name, (unit, _) in parts[0][5].items()
-    }
-    members = np.concatenate([p[2] for p in parts])
-    return task, simulation, members, histories, [e for p in parts for e in p[4]], parameters
-
-
-def _blocks(
-    task: Task,
-    simulation: Simulation,
-    members: NDArray[np.int64],
-    histories: dict[str, dict[str, NDArray[Any]]],
-    excluded: list[dict[str, Any]],
-    parameters: dict[str, tuple[str, NDArray[Any]]],
-) -> list[BlockResult]:
+def _blocks(task: Task, simulation: Simulation, flight: Flight) -> list[BlockResult]:
     found = layouts(simulation, task.duration)
+    members = flight.members
+    histories = {p: _padded(simulation.history(p, flight), layout) for p, layout in found.items()}
     results = []
     for start in range(0, len(members), BLOCK):
         part = slice(start, start + BLOCK)
@@ -254,25 +229,27 @@ def _blocks(
             cut = {name: np.ascontiguousarray(a[:, part]) for name, a in histories[path].items()}
             sums[path] = block_of(layout, cut, first=first, kinds=task.kinds)
         mine = set(members[part].tolist())
+        excluded = (e for e in flight.excluded if e["member"] in mine)
         results.append(
             BlockResult(
                 first // BLOCK,
                 sums,
-                {name: values[part].copy() for name, (_, values) in parameters.items()},
-                sorted((e for e in excluded if e["member"] in mine), key=lambda e: e["member"]),
+                {name: values[part].copy() for name, (_, values) in flight.parameters.items()},
+                sorted(excluded, key=lambda e: e["member"]),
                 simulation.kernel,
             )
         )
     return results
 
 
-def _write_histories(task: Task, simulation: Simulation, members: NDArray[np.int64]) -> None:
+def _write_histories(task: Task, simulation: Simulation, flight: Flight) -> None:
     from terrafix.cosim.records.results import write_netcdf
 
     assert task.histories is not None
     folder = Path(task.histories)
     folder.mkdir(parents=True, exist_ok=True)
-    dataset = simulation.result(wall_s=0.0, status="part of a campaign").dataset
+    dataset = simulation.result(wall_s=0.0, status="part of a campaign", flight=flight).dataset
+    members = flight.members
     for start in range(0, len(members), BLOCK):
         part = dataset.isel(member=slice(start, start + BLOCK))
         part.attrs |= {

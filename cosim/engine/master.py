@@ -6,7 +6,7 @@ due, `program` what there is to do then.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Any
 
@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 
 from terrafix.cosim.basics.arrays import Mask
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError, StepError, TerrafixError
+from terrafix.cosim.basics.errors import (
+    ComponentError,
+    ConfigurationError,
+    StepError,
+    TerrafixError,
+)
 from terrafix.cosim.engine.agenda import Agenda
 from terrafix.cosim.engine.build import bind_components, connect_ports
 from terrafix.cosim.engine.program import Entry, Program, stretch_of
@@ -36,8 +41,8 @@ class Master:
         Root seed.
     members : ndarray of int64
         Numbers of the members to fly.
-    runs : int, optional
-        How many members there are in all, where these are a part.
+    runs : int
+        How many members there are in all; these may be a part.
     quiet : bool
         Draw no noise and apply no dispersion.
 
@@ -57,7 +62,7 @@ class Master:
         *,
         seed: int,
         members: NDArray[np.int64],
-        runs: int | None = None,
+        runs: int,
         quiet: bool = False,
     ) -> None:
         self.plan = plan
@@ -78,7 +83,7 @@ class Master:
             plan.flat.components,
             seed=seed,
             members=members,
-            runs=int(members.max()) + 1 if runs is None else runs,
+            runs=runs,
         )
         self.wiring = connect_ports(plan, len(members), self.active)
         self.agenda = Agenda(plan)
@@ -129,7 +134,7 @@ class Master:
                         transfer(0)
                 entry.component.initialize()
             except Exception as error:
-                raise self._step_error(entry.path, 0, error) from error
+                raise self._component_error(entry.path, error) from error
             for collect in entry.after:
                 collect(0, 0.0)
             for clear in entry.clear:
@@ -192,8 +197,10 @@ class Master:
 
         Raises
         ------
+        ComponentError
+            If a component raises.
         StepError
-            If a component fails, or no member is left. What was recorded is untouched.
+            If no member is left, or a recorder fails. What was recorded is untouched.
         """
         if end < self.tick:
             raise ConfigurationError(
@@ -239,26 +246,25 @@ class Master:
         except Exception as error:
             if entry is None and isinstance(error, StepError):  # no member is left
                 raise
-            where = entry.path if entry is not None else "recorder"
-            raise self._step_error(where, self.tick, error) from error
+            if entry is not None:
+                raise self._component_error(entry.path, error) from error
+            raise StepError(
+                f"'recorder' failed at t = {self.seconds(self.tick):.9g} s (tick {self.tick})\n"
+                f"  {_said(error)}"
+            ) from error
         self.tick = end
 
     def _check_members(self) -> None:
         if not self.active.any():
             last = self.excluded[-1]
-            raise StepError(
-                f"no member is left at t = {last['t_s']:.9g} s (tick {self.tick})\n"
-                f"  the last, member {last['member']}, failed in '{last['component']}': "
-                f"{last['reason']}"
-            )
+            raise StepError(nobody_left(last, f"{last['t_s']:.9g} s (tick {self.tick})"))
 
-    def _step_error(self, path: str, tick: int, error: Exception) -> StepError:
-        cause = (
-            str(error) if isinstance(error, TerrafixError) else f"{type(error).__name__}: {error}"
-        )
-        return StepError(
-            f"'{path}' failed at t = {self.seconds(tick):.9g} s (tick {tick})\n  {cause}"
-        )
+    def _component_error(self, path: str, error: Exception) -> ComponentError:
+        return ComponentError(path, self.tick, self.seconds(self.tick), _said(error))
+
+    def give_up(self, error: ComponentError) -> None:
+        """Exclude all members that are left, for what a component raised."""
+        self._exclude(error.component, self.active.copy(), error.reason)
 
     def terminate(self) -> None:
         """Give back everything components hold, also after a failure; a second call does nothing.
@@ -281,7 +287,7 @@ class Master:
                 failure = failure or (path, error)
             component.release()
         if failure is not None:
-            raise self._step_error(failure[0], self.tick, failure[1]) from failure[1]
+            raise self._component_error(*failure) from failure[1]
 
     # ------------------------------------------------------------------ checkpoints
 
@@ -307,3 +313,16 @@ class Master:
         for name, state in saved["links"].items():
             self.wiring.keepers[name].set_state(state)
         self.agenda.move_to(self.tick)
+
+
+def nobody_left(last: Mapping[str, Any], when: str) -> str:
+    """Say that the last member has failed, of which `last` says how."""
+    return (
+        f"no member is left at t = {when}\n  the last, member {last['member']}, failed in "
+        f"'{last['component']}': {last['reason']}"
+    )
+
+
+def _said(error: Exception) -> str:
+    """What was raised, in words."""
+    return str(error) if isinstance(error, TerrafixError) else f"{type(error).__name__}: {error}"

@@ -13,13 +13,21 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from terrafix.cosim.basics.clock import Exact, seconds, text_seconds
 from terrafix.cosim.basics.errors import (
     CheckpointError,
+    ComponentError,
     ConfigurationError,
     RateError,
     StepError,
+    TerrafixError,
 )
+from terrafix.cosim.engine.apart import fly_apart, fly_part
+from terrafix.cosim.engine.flight import Flight
+from terrafix.cosim.engine.master import nobody_left
 from terrafix.cosim.engine.result import Result
 from terrafix.cosim.engine.simulation import Progress, Simulation
 from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
@@ -158,16 +166,68 @@ def _run(
             simulation.initialize()
         _fly(simulation, length, every, places, progress)
     except (StepError, KeyboardInterrupt) as error:
-        result = _finish(simulation, started, _status(error), places)
+        failure: BaseException | None = error
+        flight = simulation.flight()
+        if isinstance(error, ComponentError) and len(simulation.members) > 1:
+            failure, flight = _apart(simulation, length, error, flight, progress)
+        if failure is None:
+            return _finish(simulation, flight, started, "complete", places)
+        result = _finish(simulation, flight, started, _status(failure), places)
         with suppress(StepError):  # the first failure is the one to report
             simulation.master.terminate()
-        raise RunError(_kept(error, result, simulation.checkpoint), result) from error
-    result = _finish(simulation, started, "complete", places)
+        raise RunError(_kept(failure, result, simulation.checkpoint), result) from failure
+    result = _finish(simulation, simulation.flight(), started, "complete", places)
     try:
         simulation.master.terminate()
     except StepError as error:
         raise RunError(_kept(error, result, None), result) from error
     return result
+
+
+def _apart(
+    simulation: Simulation,
+    length: Fraction,
+    error: ComponentError,
+    flight: Flight,
+    progress: Progress | None,
+) -> tuple[BaseException | None, Flight]:
+    """Fly on without the members for whom a component raised.
+
+    Returns what ended the run all the same, if anything did, and what was flown: where it raises
+    for everyone, or this is interrupted, that is `flight`, as far as it came.
+    """
+    members = simulation.members
+    with suppress(StepError):
+        simulation.master.terminate()  # its components fly again
+    if progress is not None:
+        progress(f"flying the others: {error.component} failed", 0.0)
+
+    def fly(part: NDArray[np.int64], until: int | None) -> Flight:
+        return fly_part(
+            simulation.system,
+            part,
+            until,
+            seed=simulation.seed,
+            duration=length,
+            runs=simulation.runs,
+            recording=True,
+        )
+
+    try:
+        flight = fly_apart(fly, members, error, all_the_same=False)
+    except KeyboardInterrupt as interrupt:
+        return interrupt, flight
+    except TerrafixError:
+        return error, flight
+    if len(flight.excluded) == len(members):
+        last = flight.excluded[-1]
+        return StepError(nobody_left(last, f"{last['t_s']:.9g} s")), flight
+    n = sum(e["component"] == error.component for e in flight.excluded)
+    flight.notes.append(
+        f"'{error.component}' raised for {n} of {len(members)} members; the others were flown "
+        "again without them" + (", without checkpoints" if simulation.checkpoint else "")
+    )
+    return None, flight
 
 
 def _refuse_impossible(
@@ -219,11 +279,13 @@ def _fly(
             progress("running", stop / end)
 
 
-def _finish(simulation: Simulation, started: float, status: str, places: Places) -> Result:
+def _finish(
+    simulation: Simulation, flight: Flight, started: float, status: str, places: Places
+) -> Result:
     from terrafix.cosim.records.results import write_netcdf
 
     wall = time.perf_counter() - started
-    result = simulation.result(wall_s=wall, status=status)
+    result = simulation.result(wall_s=wall, status=status, flight=flight)
     result.notes = places.notes + result.notes
     target = places.result_file(complete=status == "complete")
     if target is not None:

@@ -19,6 +19,7 @@ from terrafix.cosim.basics.errors import (
 from terrafix.cosim.declare.evaluation import Evaluation
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import State
+from terrafix.cosim.engine.flight import Flight
 from terrafix.cosim.engine.master import Master
 from terrafix.cosim.engine.result import Exclusion, Result
 from terrafix.cosim.kernels.build import build_kernels
@@ -91,11 +92,12 @@ class Simulation:
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise ConfigurationError(f"seed is {self.seed!r}; it is a whole number from 0 on")
         _refuse_too_large(self.plan, len(self.members))
+        self.runs = int(self.members.max()) + 1 if runs is None else runs
         self.folder = folder
         self.checkpoint: Path | None = None
         try:
             self.master = Master(
-                self.plan, seed=self.seed, members=self.members, runs=runs, quiet=quiet
+                self.plan, seed=self.seed, members=self.members, runs=self.runs, quiet=quiet
             )
             self.kernel = self._build_kernels(progress)
             self.recorders = self._make_recorders(recording=recording)
@@ -147,7 +149,7 @@ class Simulation:
             made = recorder(record.name, record.ports)
             self.master.observe(record_rate(flat, record), made.sample)
             recorders.append(made)
-        self._histories: dict[str, Recorder] = {}
+        self._histories: dict[str, str] = {}
         taken = {r.name for r in flat.records}
         for path, component in flat.components.items():
             if isinstance(component, Evaluation):
@@ -159,7 +161,7 @@ class Simulation:
                 assert component.rate is not None
                 self.master.observe(component.rate, made.sample)
                 recorders.append(made)
-                self._histories[path] = made
+                self._histories[path] = name
         return recorders
 
     def _read_back(self) -> dict[str, tuple[str, NDArray[Any]]]:
@@ -245,8 +247,10 @@ class Simulation:
 
     # ------------------------------------------------------------------ results
 
-    def attributes(self, status: str) -> dict[str, Any]:
-        """What is stored with every result."""
+    def attributes(
+        self, status: str, excluded: list[dict[str, Any]] | None = None
+    ) -> dict[str, Any]:
+        """What is stored with every result; `excluded` where others flew it."""
         from terrafix.cosim.basics.machine import cpu_name
         from terrafix.cosim.records.results import versions
 
@@ -256,7 +260,7 @@ class Simulation:
             "status": status,
             "seed": self.seed,
             "members": [int(m) for m in self.members],
-            "excluded": self.master.excluded,
+            "excluded": self.master.excluded if excluded is None else excluded,
             "base_step_s": text_seconds(self.plan.base),
             "order": self.plan.order,
             "kernel": self.kernel,
@@ -274,50 +278,70 @@ class Simulation:
         ]
         return [f"output '{path}' was never published" for path in silent]
 
-    def history(self, path: str) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
-        """What an evaluation component published so far: times, and arrays by port name."""
-        times, arrays = self._histories[path].history()
-        return times, {n.removeprefix(f"{path}."): a for n, a in arrays.items()}
+    def flight(self) -> Flight:
+        """What was flown so far."""
+        from terrafix.cosim.records.results import from_recorders
 
-    def evaluate(self) -> dict[str, Any]:
-        """What evaluation components publish, from what was recorded so far."""
+        readers = self.master.wiring.readers
+        return Flight(
+            self.members,
+            from_recorders(self.recorders),
+            self.parameters,
+            list(self.master.excluded),
+            self.master.tick,
+            self.master.component_steps,
+            {path: r.overruns for path, r in readers.items() if r.overruns},
+            self._notes(),
+        )
+
+    def history(
+        self, path: str, flight: Flight | None = None
+    ) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
+        """What an evaluation component published: times, and arrays by port name.
+
+        Of what was flown so far, unless it was flown otherwise.
+        """
+        return (flight or self.flight()).history(self._histories[path], f"{path}.")
+
+    def evaluate(self, flight: Flight | None = None) -> dict[str, Any]:
+        """What evaluation components publish, from what was recorded so far, or otherwise."""
+        flight = flight or self.flight()
         found = {}
         for path in self._histories:
             component = self.plan.flat.components[path]
             assert isinstance(component, Evaluation)
-            found[path] = component.summarize(*self.history(path))
+            found[path] = component.summarize(*self.history(path, flight))
         return next(iter(found.values())) if len(found) == 1 else found
 
-    def result(self, *, wall_s: float, status: str = "complete") -> Result:
-        """Gather what was recorded."""
-        from terrafix.cosim.records.results import build_dataset, from_recorders
+    def result(
+        self, *, wall_s: float, status: str = "complete", flight: Flight | None = None
+    ) -> Result:
+        """Gather what was recorded here, or in a flight of the same members that went otherwise."""
+        from terrafix.cosim.records.results import build_dataset
 
+        flight = flight or self.flight()
         try:
-            evaluation = self.evaluate()
+            evaluation = self.evaluate(flight)
         except Exception:
             if status == "complete":
                 raise
             evaluation = {}  # a history cut short must not cost the records
-        attributes = self.attributes(status) | {"evaluation": evaluation}
-        dataset = build_dataset(
-            from_recorders(self.recorders), self.members, attributes, self.parameters
-        )
-        readers = self.master.wiring.readers
+        attributes = self.attributes(status, flight.excluded) | {"evaluation": evaluation}
         return Result(
             system=self.system.name,
             seed=self.seed,
             members=len(self.members),
-            excluded=cast("list[Exclusion]", list(self.master.excluded)),
-            ticks=self.master.tick,
-            component_steps=self.master.component_steps,
+            excluded=cast("list[Exclusion]", flight.excluded),
+            ticks=flight.ticks,
+            component_steps=flight.component_steps,
             wall_s=wall_s,
             setup_s=self.setup_s,
             kernel=self.kernel,
             evaluation=evaluation,
-            dataset=dataset,
+            dataset=build_dataset(flight.records, self.members, attributes, flight.parameters),
             status=status,
-            overruns={path: r.overruns for path, r in readers.items() if r.overruns},
-            notes=self._notes(),
+            overruns=flight.overruns,
+            notes=flight.notes,
         )
 
 
