@@ -33,9 +33,8 @@ def campaign_tables(
     """
     shown = overview(result)
     repeat = command(system, settings, runs=result.runs, seed=result.seed, duration=result.duration)
-    whole = {"no_wrap": True, "overflow": "ignore"}  # a line to copy
     text = f"repeat any run alone: {repeat} --member K --out member.nc"
-    shown.append(Text(text, style="dim", **whole))
+    shown.append(Text(text, style="dim", no_wrap=True))
     if result.out is not None:
         shown.append(Text(f"wrote {result.out}; terrafix report {result.out}", style="dim"))
     return shown

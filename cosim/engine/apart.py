@@ -19,10 +19,12 @@ from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.system import System
 
 Members = NDArray[np.int64]
+Places = NDArray[np.intp]
 Fly = Callable[[Members, int | None], Flight]
 """Flies members to the end, or for a look up to a tick; raises ComponentError."""
-ASKED = 5
-"""Members of a first look: where it raises for each of them alone, it is taken to for all."""
+ASKED = 4
+"""Members of a first look, and the first: where it raises for each of them alone, it is taken to
+raise for all."""
 
 
 def fly_apart(fly: Fly, members: Members, error: ComponentError, *, all_the_same: bool) -> Flight:
@@ -46,11 +48,13 @@ def fly_apart(fly: Fly, members: Members, error: ComponentError, *, all_the_same
     """
     left, flights = members, []
     while True:
-        raising = _raising(fly, left, error.tick)
-        if not all_the_same and len(raising) == len(members):
+        raises = _look(fly, left, error.tick)
+        everyone = all(raises(place) for place in _spread(len(left)))
+        if everyone and not all_the_same and len(left) == len(members):
             raise error
-        flights += [fly(left[[i]], None) for i in raising]
-        left = np.delete(left, raising)
+        places = np.arange(len(left)) if everyone else _halved(raises, len(left))
+        flights += [fly(left[[place]], None) for place in places]
+        left = np.delete(left, places)
         if not len(left):
             break
         try:
@@ -106,20 +110,26 @@ def fly_part(
         master.terminate()
 
 
-def _raising(fly: Fly, members: Members, tick: int) -> list[int]:
-    """Places of the members for whom a component raises up to a tick; with all it does."""
+def _look(fly: Fly, members: Members, tick: int) -> Callable[[Places], bool]:
+    """Whether a component raises up to a tick, for the members at some places."""
 
-    def raises(places: NDArray[np.intp]) -> bool:
+    def raises(places: Places) -> bool:
         try:
             fly(members[places], tick)
         except ComponentError:
             return True
         return False
 
-    n = len(members)
-    asked = np.unique(np.linspace(0, n - 1, min(ASKED, n)).astype(np.intp))
-    if all(raises(asked[[k]]) for k in range(len(asked))):
-        return list(range(n))
+    return raises
+
+
+def _spread(n: int) -> list[Places]:
+    """A few places of n, each alone."""
+    return [np.array([place]) for place in sorted({(n - 1) * k // ASKED for k in range(ASKED + 1)})]
+
+
+def _halved(raises: Callable[[Places], bool], n: int) -> Places:
+    """Places of n for which it raises, where it does for all n together."""
     found: list[int] = []
     suspected = [np.arange(n)]
     while suspected:
@@ -127,8 +137,7 @@ def _raising(fly: Fly, members: Members, tick: int) -> list[int]:
         if len(places) == 1:
             found.append(int(places[0]))
             continue
-        halves = np.array_split(places, 2)
-        guilty = [half for half in halves if raises(half)]
-        # together alone: with whom it raises is not to be told apart
+        guilty = [half for half in np.array_split(places, 2) if raises(half)]
+        # where it raises with neither half, but with both: each is flown alone
         suspected += guilty or [places[[k]] for k in range(len(places))]
-    return sorted(found)
+    return np.array(sorted(found))

@@ -224,8 +224,8 @@ def _apart(
         return StepError(nobody_left(last, f"{last['t_s']:.9g} s")), flight
     n = sum(e["component"] == error.component for e in flight.excluded)
     flight.notes.append(
-        f"'{error.component}' raised for {n} of {len(members)} members; the others were flown "
-        "again without them" + (", without checkpoints" if simulation.checkpoint else "")
+        f"'{error.component}' raised with all {len(members)} members: {n} of them were given up, "
+        "and the others flown again without them"
     )
     return None, flight
 

@@ -32,10 +32,14 @@ def plain(value: Any) -> Any:
 
 
 def show(*renderables: Any) -> None:
-    """Print for a person; wide enough for tables where nobody's terminal says otherwise."""
+    """Print for a person; wide enough for tables where nobody's terminal says otherwise.
+
+    A text that is not to be wrapped (a command to copy) is one line, however long.
+    """
     from rich.console import Console
 
     console = Console(highlight=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = 100
-    console.print(*renderables, sep="\n")
+    for each in renderables:
+        console.print(each, soft_wrap=bool(getattr(each, "no_wrap", None)))

@@ -6,7 +6,7 @@ import pytest
 from terrafix.components.truth.attitude import LvlhAttitude
 from terrafix.components.truth.orbit import OrbitTruth
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import SystemCheckError
+from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Output
 from terrafix.cosim.engine.run import RunError, simulate
@@ -37,6 +37,20 @@ def orbit_system(r0=R0, v0=V0, rate="0.1", **options):
 def test_a_start_inside_the_earth_is_refused(r0):
     with pytest.raises(SystemCheckError, match=r"'orbit.r0_i' lies inside the Earth: "):
         simulate(orbit_system(r0), duration="1")
+
+
+def test_one_number_is_no_position():
+    with pytest.raises(ConfigurationError, match=r"'r0_i' is one number; .*\n.* of frame 'i'"):
+        OrbitTruth(r0_i="7070 km")
+    system = System("list", duration=1)
+    system.add(OrbitTruth(r0_i="[7070, 0, 0] km", v0_i="[0, 0, 7.5] km/s"), "orbit")
+    system.disperse(Dispersion("start", ("orbit.r0_i",), ["7070 km", "7080 km"], "list"))
+    with pytest.raises(SystemCheckError, match="values of dispersion 'start' is one number"):
+        simulate(system)
+    system.dispersions.clear()
+    system.disperse(Dispersion("start", ("orbit.r0_i",), "1 km"))  # a sigma per axis is one
+    flown = simulate(system, members=9).dataset["parameter:orbit.r0_i"].values
+    assert np.ptp(flown, axis=0).min() > 100.0
 
 
 @pytest.mark.parametrize("r0", [[0.0, 0.0, EARTH.polar_radius + 1.0], [EARTH.radius + 1.0, 0, 0]])

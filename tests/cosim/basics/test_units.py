@@ -163,6 +163,7 @@ class Part(Component):
     r0 = Parameter([1.0, 2.0, 3.0], shape=(3,), unit="m")
     mass = Parameter(unit="kg", positive=True)
     gate = Parameter(math.inf, minimum=0, infinite=True)
+    v0 = Parameter(0.0, shape=(3,), unit="m/s", frame="i")
     mixed = Parameter([0.0, 0.0], shape=(2,), unit=("m", "s"))
     mode = Choice(["two-body", "j2"], "j2")
     n = Count(3, minimum=1, maximum=9)
@@ -180,6 +181,8 @@ class Part(Component):
         ("r0", "[7000, 0, 1_0] km", [7e6, 0, 1e4]),
         ("r0", "1, 2, 3 m", [1, 2, 3]),
         ("r0", 5, [5, 5, 5]),
+        ("v0", "[0, 7.5, 0] km/s", [0, 7500, 0]),
+        ("v0", 0, [0, 0, 0]),
         ("r0", {"value": [1, 2, 3], "unit": "km"}, [1e3, 2e3, 3e3]),
         ("mass", "500 g", 0.5),
         ("gate", "inf", math.inf),
@@ -200,6 +203,12 @@ def test_numbers_are_read_with_their_units(name, value, read):
             r"has shape \(2,\); it takes array \(3,\) \[m\]: write \"\[1\.0, 1\.0, 1\.0\] m\"",
         ),
         ("r0", "1 s", r"given in s; it takes .*\n  the units differ: s is not m"),
+        (
+            "v0",
+            "7.5 km/s",
+            r"is one number; it takes .*\n  one for each axis of frame 'i'",
+        ),
+        ("v0", 1, r'is one number; it takes .* write "\[1\.0, 1\.0, 1\.0\] m/s"'),
         ("r0", "far away", "is 'far away', which is not a number"),
         ("r0", [1, 2, math.nan], "must be finite"),
         ("r0", [1, 2, math.inf], "must be finite"),

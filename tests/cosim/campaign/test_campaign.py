@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from terrafix.cosim.campaign.batch import FileSource
 from terrafix.cosim.campaign.campaign import CampaignError, run_campaign
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.kernels import toolchain
+from terrafix.cosim.report.report import write_report
 from terrafix.cosim.system.dispersion import Dispersion
 
 
@@ -177,6 +179,15 @@ def test_a_component_that_raises_costs_its_member_alone():
     np.testing.assert_array_equal(mine["mean_error"][:7], right["mean_error"][:7])
 
 
+def test_histories_have_all_members_where_one_raises(tmp_path):
+    fly(scalar_system(tripwire=70), runs=130, out=tmp_path / "c", histories=True)
+    files = sorted((tmp_path / "c" / "histories").iterdir())
+    members = [xr.load_dataset(file)["member"].values.tolist() for file in files]
+    assert members == [[*range(64)], [*range(64, 128)], [128, 129]]
+    error = xr.load_dataset(files[1])["judge.x_error"].values[..., 0]
+    assert np.isfinite(error).sum(axis=0).tolist() == [21] * 6 + [7] + [21] * 57
+
+
 def test_nobody_left_is_an_error():
     with pytest.raises(CampaignError, match="no member is left of 10"):
         fly(scalar_system(wall=-50.0), runs=10)
@@ -209,6 +220,13 @@ def test_a_system_without_evaluation_is_refused():
 # ------------------------------------------------------------------------- what is given, and shown
 
 
+def run_cli(*words):
+    """What a command prints."""
+    done = CliRunner().invoke(main, [*map(str, words)], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
 @pytest.fixture
 def file(tmp_path, monkeypatch):
     """A system file whose components this process knows."""
@@ -230,6 +248,26 @@ def test_a_path_is_enough(file, whole, monkeypatch):
         [*pair] for pair in (*given.settings, ("filter.wall", "4 m"))
     ]
     assert contents(last) == contents(fly(scalar_system(wall=4.0, tuning=2.0), runs=64))
+
+
+def test_the_command_that_repeats_a_run_repeats_it(file, tmp_path):
+    """As it is printed, and as it stands on the page: settings, seed and duration with it."""
+    folder = tmp_path / "my campaign"
+    said = ["--set", "filter.wall=4 m", "--set", "judge.rate=0.5 Hz", "--duration", "12"]
+    words = ["campaign", str(file), *said, "--runs", "70", "--seed", "9"]
+    shown = run_cli(*words, "--out", folder, "--histories")
+    path, _ = write_report(folder, analyze=False)
+    page = unescape(re.search(r"<pre>(.*--member K.*)</pre>", path.read_text())[1])
+    printed = next(line for line in shown.splitlines() if line.startswith("repeat any run alone"))
+    right = xr.load_dataset(folder / "histories" / "000001.nc").sel(member=66)
+    for command in (printed.removeprefix("repeat any run alone: "), page):
+        assert command.split()[0] == "terrafix"
+        out = tmp_path / "member.nc"
+        words = shlex.split(command.replace("member.nc", shlex.quote(str(out))))
+        run_cli(*("66" if word == "K" else word for word in words[1:]))
+        mine = xr.load_dataset(out).isel(member=0)
+        assert mine["time"].values.tolist() == [0, 2, 4, 6, 8, 10, 12]
+        assert mine["judge.x_error"].values.tobytes() == right["judge.x_error"].values.tobytes()
 
 
 def test_what_cannot_be_flown_is_refused(file):

@@ -110,6 +110,19 @@ def test_what_a_killed_run_left_is_kept_and_said(tmp_path, toys):
     assert len(read_result(kept)["time"]) >= 51
 
 
+def test_what_is_damaged_beyond_reading_does_not_block_the_next(tmp_path, toys):
+    """An old version's manifest, say: it is moved aside, whole."""
+    out, left = tmp_path / "run.nc", tmp_path / "run.nc.parts"
+    left.mkdir()
+    (left / "manifest.json").write_text('{"schema": "terrafix-records/1"}')
+    (left / "c.000000.npz").write_bytes(b"what")
+    result = simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
+    aside = tmp_path / "run.nc.interrupted.parts"
+    assert result.notes == [f"what an interrupted run had recorded is kept in '{aside}'"]
+    assert (aside / "c.000000.npz").read_bytes() == b"what"
+    assert len(read_result(out)["time"]) == 4
+
+
 def test_a_failed_run_does_not_replace_an_earlier_result(tmp_path, toys):
     out = tmp_path / "run.nc"
     simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)

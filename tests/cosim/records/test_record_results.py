@@ -11,7 +11,7 @@ import pytest
 import xarray
 
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError, RateError
+from terrafix.cosim.basics.errors import ConfigurationError, RateError, SystemCheckError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.evaluation import Evaluation
 from terrafix.cosim.declare.parameters import Parameter
@@ -79,6 +79,48 @@ def test_results_are_labeled_with_units_frames_and_where_they_came_from(toys, tm
     assert toys.payload(data) == toys.payload(result.dataset)
     assert json.dumps(result.summary())
     assert [p.name for p in tmp_path.iterdir()] == ["r.nc"]
+
+
+class Labeled(Component):
+    """Two ports whose labels begin and end alike, one with a slash, one with other breaks."""
+
+    default_rate = Rate("1")
+    long = Output((4,), labels=("roll_of_the_antenna", "p", "q", "yaw_of_the_antenna"))
+    short = Output((3,), labels=("roll_of_the_antenna", "p", "yaw_of_the_antenna"))
+    slash = Output((2,), labels=("m/s", "rad/s"))
+    broken = Output((2,), labels=("a_b", "c"))
+    again = Output((2,), labels=("a", "b_c"))
+    same = Output((2,), labels=("a", "b_c"))
+
+    def _initialize_impl(self):
+        for name, port in self.outputs().items():
+            self.port_views[name][...] = np.arange(port.fields[""].size)
+
+    def _step_impl(self, t, dt):
+        pass
+
+
+def test_axes_go_by_all_their_labels(toys, tmp_path):
+    system = toys.wire({"part": Labeled()}, [], duration=1)
+    system.record("all", [f"part.{name}" for name in Labeled().ports])
+    out = tmp_path / "r.nc"
+    simulate(system, out=out)
+    data = read_result(out)
+    for name, port in Labeled().ports.items():
+        array, labels = data[f"part.{name}"], port.fields[""].labels
+        axis = array.dims[-1]
+        assert tuple(data[axis].values) == labels
+        assert array.sel({axis: labels[-1]}).values[0, 0] == len(labels) - 1
+    dims = {name: data[f"part.{name}"].dims[-1] for name in Labeled().ports}
+    assert dims["same"] == dims["again"] != dims["broken"]
+    assert dims["slash"] == "axis_m_s_rad_s"
+    assert len(set(dims.values())) == 5
+    assert not list(tmp_path.glob("*.parts"))
+
+
+def test_fields_have_names_that_files_can_hold():
+    with pytest.raises(ConfigurationError, match="'a/b' cannot name a field"):
+        BundleOutput({"a/b": Field()})
 
 
 def test_a_recorder_samples_at_its_own_rate_after_everything_has_stepped(toys):
@@ -247,6 +289,22 @@ def test_durations_that_cannot_be_are_refused(toys):
     with pytest.raises(RateError, match="a binary fraction"):
         simulate(system, duration=0.5)
     simulate(system, duration=1)
+
+
+@pytest.mark.parametrize(
+    ("duration", "said"),
+    [("10", r"10 s, .* base steps of 0\.3 s\n  give 9\.9 s or 10\.2 s"), ("0.4", "0.3 s or 0.6 s")],
+)
+def test_a_duration_is_not_cut(toys, duration, said):
+    """33 steps of 0.3 s are 9.9 s."""
+    system = toys.wire({"c": toys.Clock(rate=Rate("0.3"))}, [], ["c.t"], duration=duration)
+    with pytest.raises(RateError, match=said):
+        simulate(system)
+    with pytest.raises(SystemCheckError, match=said):
+        system.check()
+    assert simulate(system, duration="9.9").ticks == 33
+    system.record("finer", ["c.t"], period="0.1")  # a recorder, too, makes base steps
+    assert simulate(system).ticks == 10 * float(duration)
 
 
 def test_a_full_disk_is_an_error_that_names_the_file(toys, tmp_path, monkeypatch):

@@ -331,7 +331,7 @@ def _lower(name: str) -> str:
 
 def start_values(system: System, plan: Plan, path: str) -> dict[str, dict[str, Any]]:
     """What a component reads at t = 0 of its system, first member: by port and field."""
-    master = Master(plan, seed=system.seed, members=np.zeros(1, dtype=np.int64))
+    master = Master(plan, seed=system.seed, members=np.zeros(1, dtype=np.int64), runs=1)
     try:
         try:
             master.initialize(observe=False)
