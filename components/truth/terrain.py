@@ -41,7 +41,7 @@ class Terrain(Component):
     )
     mirrored = Flag(False, doc="go on for ever in mirror images: artificial, without borders")
     fill_voids = Flag(False, doc="interpolate voids, and say so, instead of refusing them")
-    surface_seed = Count(0, doc="of texture and bright points")
+    surface_seed = Count(0, maximum=2**53, doc="of texture and bright points")
     parcels = Parameter(2.5, minimum=0.0, doc="texture with sharp borders, standard deviation [dB]")
     smooth = Parameter(1.5, minimum=0.0, doc="smooth texture, standard deviation [dB]")
     fine = Parameter(1.5, minimum=0.0, doc="fine texture, standard deviation [dB]")

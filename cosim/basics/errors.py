@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 
 class TerrafixError(Exception):
@@ -50,6 +51,9 @@ class ComponentError(StepError):
         super().__init__(f"'{component}' failed at t = {t_s:.9g} s (tick {tick})\n  {reason}")
         self.component, self.tick, self.t_s, self.reason = component, tick, t_s, reason
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.component, self.tick, self.t_s, self.reason)
+
 
 class SystemCheckError(TerrafixError):
     """Every problem found in one system, reported together.
@@ -61,13 +65,16 @@ class SystemCheckError(TerrafixError):
     """
 
     def __init__(self, system: str, problems: Sequence[TerrafixError], file: str = "") -> None:
-        self.system = system
+        self.system, self.file = system, file
         self.problems = tuple(problems)
         count = len(self.problems)
         where = f" ({file})" if file else ""
         lines = [f"system '{system}'{where} has {count} problem{'s' if count > 1 else ''}"]
         lines += [f"{type(p).__name__}: {p}" for p in self.problems]
         super().__init__("\n".join(lines))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.system, self.problems, self.file)
 
 
 def nearest(name: str, candidates: Iterable[str], *, what: str = "") -> str:

@@ -168,7 +168,8 @@ def _run(
     except (StepError, KeyboardInterrupt) as error:
         failure: BaseException | None = error
         flight = simulation.flight()
-        if isinstance(error, ComponentError) and len(simulation.members) > 1:
+        mistake = isinstance(error.__cause__, ConfigurationError)  # everybody's
+        if isinstance(error, ComponentError) and not mistake and len(simulation.members) > 1:
             failure, flight = _apart(simulation, length, error, flight, progress)
         if failure is None:
             return _finish(simulation, flight, started, "complete", places)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Input, Output
 from terrafix.cosim.engine.run import RunError, simulate
@@ -115,6 +116,16 @@ def test_what_raises_only_together_costs_nobody(toys):
     assert result.excluded == []
     assert result.dataset["part.y"].values.tobytes() == healthy["part.y"].values.tobytes()
     assert "0 of them were given up" in result.notes[0]
+
+
+def test_a_mistake_in_the_configuration_is_everybodys(toys):
+    class Shared(Fussy):
+        def _raise(self, step):
+            if self.n_members > 1 and step == 2:
+                raise ConfigurationError("one for all")
+
+    with pytest.raises(RunError, match=r"'part' failed at t = 2 s \(tick 4\)\n  one for all"):
+        simulate(system_of(toys, {}, Shared), members=4)
 
 
 def test_an_interrupt_while_the_others_fly_keeps_what_was_recorded(toys, tmp_path):
