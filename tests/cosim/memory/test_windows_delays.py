@@ -85,6 +85,24 @@ def test_a_delayed_signal_is_the_value_of_then(toys, name):
     assert spy.values() == [(t / 2, max(0, (t - 3) // 2)) for t in range(1, 9)]
 
 
+@pytest.mark.parametrize("delay", ["0", "1"])
+@pytest.mark.parametrize("source", ["a", "z"])  # initialized before the spy, or after
+def test_nothing_delayed_has_arrived_at_the_start(toys, source, delay):
+    """What is read at t = 0 without a delay is the value of then."""
+
+    class Eager(toys.EndSpy):
+        def _initialize_impl(self):
+            super()._initialize_impl()
+            self.seen.append((0.0, 0.0, self.look()))
+
+    spy = Eager()
+    parts = {source: toys.Clock(), "m": spy}
+    toys.fly(toys.wire(parts, [f"{source}.t -> m.u delay {delay}"]), 2)
+    (_, first), *later = spy.values()
+    assert np.isnan(first) if delay == "1" else first == 0
+    assert later == [(1, 1 - float(delay)), (2, 2 - float(delay))]
+
+
 def test_a_delay_and_a_start_read_add_up(toys):
     spy = toys.StartSpy()
     toys.fly(toys.wire({"m": toys.Clock(), "a": spy}, ["m.t -> a.u delay 2"]), 6)

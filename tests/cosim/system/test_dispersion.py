@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import kstest, truncnorm, uniform
 
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.run import simulate
@@ -58,6 +59,58 @@ def test_the_spread_is_the_standard_deviation_or_the_half_width(toys, kind):
     np.testing.assert_allclose(draws.std(axis=0), sigma, rtol=4 / np.sqrt(2 * n))
     assert kind == "normal" or np.abs(draws).max() < 1
     assert abs(np.corrcoef(draws.T)[0, 1]) < 4 / np.sqrt(n)
+
+
+def drawn(toys, spread, kind, n=4000, **options):
+    """Values of ekf.start, (n, 2), about 10 and 20 m."""
+    dispersion = Dispersion("d", ("ekf.start",), spread, kind, **options)
+    return starts(pair(toys, dispersion), members=n)["ekf"]
+
+
+def test_a_factor_is_spread_evenly_in_its_logarithm(toys):
+    """Between p / f and p f."""
+    logs = np.log(drawn(toys, [2.0, 5.0], "log_uniform") / [10, 20]) / np.log([2, 5])
+    assert kstest(logs[:, 0], uniform(-1, 2).cdf).pvalue > 1e-3
+    assert kstest(logs[:, 1], uniform(-1, 2).cdf).pvalue > 1e-3
+
+
+def test_a_truncated_draw_is_normal_within_its_limit(toys):
+    z = (drawn(toys, [100.0, 1.0], "truncated", limit=1.5) - [10, 20]) / [100, 1]
+    for column in z.T:
+        assert kstest(column, truncnorm(-1.5, 1.5).cdf).pvalue > 1e-3
+
+
+def test_correlated_draws_have_their_covariance_and_are_normal(toys):
+    """Whitened by the inverse of the lower Cholesky factor, they are independent."""
+    covariance = np.array([[4.0, -1.8], [-1.8, 1.0]])
+    e = drawn(toys, covariance, "multivariate") - [10, 20]
+    z = np.linalg.solve(np.linalg.cholesky(covariance), e.T)
+    assert abs(np.corrcoef(z)[0, 1]) < 4 / np.sqrt(4000)
+    for row in z:
+        assert kstest(row, "norm").pvalue > 1e-3
+
+
+def test_members_take_the_values_of_a_list_by_their_number(toys):
+    dispersion = Dispersion("d", ("ekf.start",), [[1, 2], [3, 4], [5, 6]], "list")
+    found = starts(pair(toys, dispersion), members=[5, 3, 7])["ekf"]
+    assert found.tolist() == [[5, 6], [1, 2], [3, 4]]  # 5, 3 and 7 modulo 3
+
+
+@pytest.mark.parametrize("design", ["latin_hypercube", "sobol"])
+def test_a_design_is_laid_out_over_all_runs_and_all_dispersions(toys, design):
+    """Each of 16 cells of each of four axes holds one of 16 members, whoever is flown."""
+    one = Dispersion("one", ("ekf.start",), [1.0, 1.0], "uniform", design)
+    two = Dispersion("two", ("ukf.start",), [1.0, 1.0], "uniform", design)
+
+    def cells(members):
+        found = starts(pair(toys, one, two), members=members, runs=16)
+        places = np.hstack([found["ekf"], found["ukf"]]) - [10, 20, 10, 20]
+        return np.floor((places + 1) * 8).astype(int)
+
+    whole = cells(16)
+    assert (np.sort(whole, axis=0) == np.arange(16)[:, None]).all()
+    assert len({tuple(column) for column in whole.T}) == 4
+    assert cells([9, 2]).tolist() == whole[[9, 2]].tolist()
 
 
 def test_units_and_dispersed_values_are_read_back_in_the_result(toys):
