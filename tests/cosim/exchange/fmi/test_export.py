@@ -140,6 +140,26 @@ def test_a_whole_system_as_one_fmu(tmp_path, fmi):
     assert np.array_equal(a.sequence, b.sequence)
 
 
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_what_is_read_at_the_start_is_that_of_then(tmp_path, fmi):
+    """A ramp 1 + t at 100 Hz, read at the start of steps of h = 0.05 s and summed up.
+
+    After k steps that is 1 + h (1 + 0) + ... + h (1 + (k - 1) h) = 1 + k h + h^2 k (k - 1) / 2.
+    """
+    with System("ramp") as system:
+        ramp = system.add(fmu_parts.EulerIntegrator(drive=1.0), "a")
+        slow = system.add(fmu_parts.EulerIntegrator(rate=Rate("0.05")), "b")
+        system.connect(ramp["y"], slow["u"])
+        system.expose("sum", slow["y"])
+    export_fmu(system, tmp_path / "ramp.fmu", fmi=fmi)
+    with System("outer", duration="0.5") as outer:
+        outer.add(Fmu(file=tmp_path / "ramp.fmu", rate=Rate("0.01")), "whole")
+        outer.record("sum", ["whole.sum"], period="0.05")
+    k, h = np.arange(11), 0.05
+    right = 1 + k * h + h**2 * k * (k - 1) / 2
+    np.testing.assert_allclose(simulate(outer).dataset["whole.sum"].values[:, 0], right, rtol=1e-13)
+
+
 def test_exposed_inputs_of_a_system_stay_outside(tmp_path):
     with System("pair") as system:
         first = system.add(fmu_parts.Spring(), "first")
