@@ -45,6 +45,8 @@ def test_written_seconds_read_back_exactly_beyond_a_decimals_digits(value):
         ("1/30", Fraction(1, 30)),
         ("10 ms", Fraction(1, 100)),
         ("2 min", Fraction(120)),
+        ("1.5 h", Fraction(5400)),
+        ("250 us", Fraction(1, 4000)),
         (3, Fraction(3)),
         (Decimal("0.1"), Fraction(1, 10)),
         ("1e-3 s", Fraction(1, 1000)),
@@ -52,6 +54,14 @@ def test_written_seconds_read_back_exactly_beyond_a_decimals_digits(value):
 )
 def test_times_are_read_exactly(text, exact):
     assert seconds(text) == exact
+
+
+@pytest.mark.parametrize(
+    ("text", "period"),
+    [("50", "0.02"), ("4 kHz", "1/4000"), ("2 MHz", "1/2000000"), ("3 Hz", "1/3")],
+)
+def test_rates_are_read_exactly(text, period):
+    assert Rate(hz=text) == Rate(period)
 
 
 @pytest.mark.parametrize(
@@ -79,6 +89,9 @@ def test_schedules_that_contradict_themselves_are_refused():
         Rate("1", hz=1)
     with pytest.raises(RateError, match="times must be increasing"):
         Rate(times=["1", "1"])
+    for times in (["2", "1"], ["1", "3", "2"], ["-1", "1"]):
+        with pytest.raises(RateError, match="times must be increasing and not negative"):
+            Rate(times=times)
     with pytest.raises(RateError, match="an offset goes with a period"):
         Rate(times=["1"], offset="1")
     with pytest.raises(RateError, match="times is the text"):

@@ -194,6 +194,25 @@ def test_numbers_are_read_with_their_units(name, value, read):
     np.testing.assert_allclose(part.setting(name), read, rtol=1e-15)
 
 
+class Bounded(Component):
+    """Bounds are among what is taken; what is positive is beyond zero."""
+
+    share = Parameter(0.5, minimum=0.25, maximum=0.75)
+    n = Count(2, minimum=1, maximum=9)
+
+
+@pytest.mark.parametrize(
+    ("name", "inside", "outside"),
+    [("share", (0.25, 0.75), (0.2499999, 0.7500001)), ("n", (1, 9), (0, 10))],
+)
+def test_bounds_are_taken_and_nothing_beyond(name, inside, outside):
+    for value in inside:
+        assert Bounded(**{name: value}).setting(name) == value
+    for value in outside:
+        with pytest.raises(ConfigurationError, match=r"it must be at (least|most)"):
+            Bounded(**{name: value})
+
+
 @pytest.mark.parametrize(
     ("name", "value", "text"),
     [

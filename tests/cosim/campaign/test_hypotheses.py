@@ -166,3 +166,47 @@ def test_two_members_more_than_axes_are_judged():
         statistics = Statistics(layout(3))
         statistics.add(block_of(layout(3), history(e, np.eye(3)), first=0))
         assert judge(statistics).words == (word,)
+
+
+def test_means_over_epochs_count_every_value_and_intervals_what_is_independent():
+    """NEES of 2 and 8 members, of which the first epoch has no fix; NIS of both fixes of 8."""
+    z = np.random.default_rng(12).normal(size=(3, 8, 2))
+    e = np.random.default_rng(13).normal(size=(3, 8, 1))
+    z[0], e[2, 2:], z[2, 2:] = np.nan, np.nan, np.nan
+    drawn = history(e, np.eye(1), z)
+    statistics = Statistics(layout(n_epochs=3))
+    statistics.add(block_of(layout(n_epochs=3), drawn, first=0))
+    summary = statistics.summary()
+    nees = np.concatenate([drawn["nees"][1], drawn["nees"][2, :2]])
+    assert summary["nees"]["mean"] == pytest.approx(nees.mean())
+    bounds = chi2.ppf([0.025, 0.975], 8) / 8  # of one epoch: it is correlated with the others
+    assert summary["nees"]["interval_95"] == pytest.approx(bounds.tolist())
+    nis = drawn["nis"][np.isfinite(drawn["nis"])]
+    assert summary["nis"]["mean"] == pytest.approx(nis.mean())
+    bounds = chi2.ppf([0.025, 0.975], 2 * 10) / 10
+    assert summary["nis"]["interval_95"] == pytest.approx(bounds.tolist())
+
+
+def test_pairs_of_innovations_are_of_elements_measured_twice():
+    """The second of two elements is missing every other time: it has no pair."""
+    z = np.ones((6, 1, 2))
+    z[1::2, :, 1] = np.nan
+    statistics = Statistics(layout(n_epochs=6))
+    statistics.add(
+        block_of(layout(n_epochs=6), history(np.zeros((6, 1, 1)), np.eye(1), z), first=0)
+    )
+    assert statistics["innovation_pairs"].tolist() == [5, 0]
+    assert statistics["innovation_correlation"][0] == 1.0
+
+
+def test_a_bias_speaks_for_nis_too():
+    """Innovations that are too large because of a mean error say nothing of the sigmas."""
+    rng = np.random.default_rng(14)
+    e = rng.normal(size=(1, 50, 1)) + 2.0
+    z = rng.normal(size=(1, 50, 1)) * 3.0
+    statistics = Statistics(layout())
+    statistics.add(block_of(layout(), history(e, np.eye(1), z), first=0))
+    assert judge(statistics).words == ("biased",)
+    unbiased = Statistics(layout())
+    unbiased.add(block_of(layout(), history(e - 2.0, np.eye(1), z), first=0))
+    assert judge(unbiased).words == ("overconfident",)

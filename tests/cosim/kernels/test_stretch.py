@@ -135,6 +135,31 @@ def test_stretches_are_flown(monkeypatch):
     assert sum(flown) > 250  # of 300 ticks
 
 
+class Stairs(Component):
+    """Publishes the time of its step."""
+
+    default_rate = Rate("0.1")
+    t = Output((2,))
+
+    def _initialize_impl(self):
+        self.t = 0.0
+
+    def _step_impl(self, t, dt):
+        self.t = [t, 1.0]
+
+
+@pytest.mark.parametrize("name", ["a", "z"])
+def test_a_stretch_ends_before_somebody_else_is_due(name):
+    """At tick k of 10 ms, 0.1 floor(k / 10) is read: in 1 s that adds up to 0.1 (10 * 45 + 10)."""
+    system = System("stairs", duration=1)
+    stairs, total = system.add(Stairs(), name), system.add(Sum(), "sum")
+    system.connect(stairs["t"], total["u"])
+    simulation = Simulation(system)
+    simulation.run_until(1)
+    assert simulation.master.wiring.slots["sum.total"].data[0, 0] == pytest.approx(46.0)
+    simulation.master.terminate()
+
+
 @pytest.mark.parametrize("members", [1, 8, 21])
 def test_bytes_are_those_of_a_call_per_tick(members, monkeypatch):
     assert fly("vector", monkeypatch, members) == fly("c", monkeypatch, members)

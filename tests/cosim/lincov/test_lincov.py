@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from campaign_parts import Filter, Judge, scalar_system
+from scipy.stats import norm
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.campaign.campaign import run_campaign
@@ -56,6 +57,22 @@ def test_dispersions_are_sources():
         np.sqrt(sampled["covariance_sample"][-1, 0, 0]), rel=4 / np.sqrt(8000)
     )
     assert found.budget()["dispersion bias"][0] == pytest.approx(0.3, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "spread", "sigma"),
+    [
+        ("uniform", 0.3, 0.3 / np.sqrt(3)),  # half a width
+        # 1 - 2 a phi(a) / (2 Phi(a) - 1) of the variance is left at a limit of a = 1 sigma
+        ("truncated", 0.3, 0.3 * np.sqrt(1 - 2 * norm.pdf(1) / (2 * norm.cdf(1) - 1))),
+        ("list", [-0.3, 0.0, 0.3], 0.3 * np.sqrt(2 / 3)),  # each a third of the members
+    ],
+)
+def test_each_kind_of_dispersion_has_its_variance(kind, spread, sigma):
+    system = scalar_system()
+    system.disperse(Dispersion("bias", ("filter.bias",), spread, kind, limit=1.0))
+    found = linear_covariance(system).budget()["dispersion bias"][0]
+    assert found == pytest.approx(sigma, rel=1e-3)  # the gain is nearly 1 in the end
 
 
 def test_a_prediction_survives_being_stored():

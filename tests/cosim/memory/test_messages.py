@@ -184,6 +184,9 @@ def test_ragged_messages_carry_their_count_per_member(toys):
     assert all((s == 2.0).all() for s in trace.seen)
     assert result.dataset["c.outline.count"].values.tolist() == [[0, 0, 0], [1, 2, 0], [2, 3, 0]]
     assert np.isnan(result.dataset["c.outline"].values[:, 2]).all()
+    system.record("finer", ["c.outline"], period="0.5")
+    finer = simulate(system, members=1).dataset["c.outline.count@finer"]
+    assert finer.values[:, 0].tolist() == [0, 0, 1, 0, 2]  # none came in between
 
 
 def test_a_ragged_message_needs_a_count_within_its_capacity(toys):

@@ -103,6 +103,26 @@ def test_nothing_delayed_has_arrived_at_the_start(toys, source, delay):
     assert later == [(1, 1 - float(delay)), (2, 2 - float(delay))]
 
 
+class Both(Component):
+    """Reads a signal at the start of its step and at its end."""
+
+    default_rate = Rate("1")
+    before = Input(unit="s", at="start")
+    now = Input(unit="s")
+
+    def _step_impl(self, t, dt):
+        self.seen = [*getattr(self, "seen", []), (float(self.before[0]), float(self.now[0]))]
+
+
+@pytest.mark.parametrize("rate", ["1", "0.5"])
+def test_what_is_read_at_the_start_is_that_of_the_step_before(toys, rate):
+    """Also where the source steps first, because it is read at the end too."""
+    both = Both()
+    parts = {"clock": toys.Clock(rate=Rate(rate)), "both": both}
+    toys.fly(toys.wire(parts, ["clock.t -> both.before", "clock.t -> both.now"]), 3)
+    assert both.seen == [(0, 1), (1, 2), (2, 3)]
+
+
 def test_a_delay_and_a_start_read_add_up(toys):
     spy = toys.StartSpy()
     toys.fly(toys.wire({"m": toys.Clock(), "a": spy}, ["m.t -> a.u delay 2"]), 6)
