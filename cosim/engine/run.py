@@ -45,6 +45,9 @@ class RunError(StepError):
         super().__init__(message)
         self.result = result
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.result)
+
 
 def simulate(
     system: System,

@@ -139,7 +139,7 @@ def _load(files: tuple[Path, ...], settings: Settings) -> tuple[System, Load]:
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows put a mark first
     except FileNotFoundError:
         there = [p.name for p in path.parent.glob("*.toml")]
         near = nearest(path.name, there, what="system files there")

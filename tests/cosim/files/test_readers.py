@@ -8,6 +8,7 @@ import pytest
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.files.readers import read_system
+from terrafix.cosim.files.writing import system_text
 
 TOML = (Path(__file__).parents[3] / "examples" / "orbit.toml").read_text()
 
@@ -117,3 +118,13 @@ def test_settings_do_not_reach_into_a_package(tmp_path):
         "  terrafix ssp import writes it as a system file, where everything can be set"
     )
     assert refusal(tmp_path / "coast.ssp") == f"there is no SSP package '{tmp_path}/coast.ssp'"
+
+
+@pytest.mark.parametrize(
+    ("mark", "end"), [(b"\xef\xbb\xbf", b"\r\n"), (b"", b"\r\n"), (b"", b"\n")]
+)
+def test_a_file_of_an_editor_of_windows_is_read(tmp_path, mark, end):
+    file, plain = tmp_path / "orbit.toml", tmp_path / "plain.toml"
+    file.write_bytes(mark + TOML.encode().replace(b"\n", end))
+    plain.write_text(TOML)
+    assert system_text(read_system(file)) == system_text(read_system(plain))

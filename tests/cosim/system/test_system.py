@@ -1,10 +1,13 @@
 """Systems: building, nesting, exposing, and every mistake reported at once."""
 
+import pickle
+
 import numpy as np
 import pytest
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import (
+    ComponentError,
     ConfigurationError,
     RateError,
     SystemCheckError,
@@ -277,6 +280,20 @@ def test_a_port_is_exposed_under_one_name_once(toys):
     system = nested(toys, Late())
     with pytest.raises(ConfigurationError, match=r"exposes 'part\.t' as 'time' already"):
         system.expose("time", "other.t")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        SystemCheckError("s", [WiringError("a"), RateError("b")], "s.toml"),
+        ComponentError("nav.imu", 7, 0.07, "ValueError: no"),
+    ],
+)
+def test_errors_cross_from_process_to_process_whole(error):
+    """A worker of a campaign raises what its parent is told."""
+    again = pickle.loads(pickle.dumps(error))
+    assert (type(again), str(again)) == (type(error), str(error))
+    assert [*map(str, vars(again).values())] == [*map(str, vars(error).values())]
 
 
 class Needy(Component):

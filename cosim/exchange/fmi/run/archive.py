@@ -200,9 +200,11 @@ def _read(file: Path, folder: Path) -> Archive:
     try:
         description = read_model_description(str(folder), validate=False)
     except Exception as error:  # FMPy raises many types for what it cannot read
+        stumbled = isinstance(error, TypeError | AttributeError | LookupError)
+        why = f"it lacks what FMI {version} asks for" if stumbled else str(error)
         raise ConfigurationError(
-            f"'{file}': modelDescription.xml cannot be understood: {error}\n"
-            f"  terrafix check-fmu {file} says more"
+            f"'{file}': modelDescription.xml cannot be understood: {why}\n"
+            "  ask for another from the tool that wrote it"
         ) from error
     directional = any(
         each.get(name) in ("true", "1")
