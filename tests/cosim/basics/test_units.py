@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, WiringError
-from terrafix.cosim.basics.units import conversion_factor
+from terrafix.cosim.basics.units import base_units, conversion_factor
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Flag, Parameter, Text
 from terrafix.cosim.declare.ports import Input, Output
@@ -71,6 +71,28 @@ def test_a_common_mistake_is_answered(source, target, advice):
     a, b = Output(unit=source), Input(unit=target)
     with pytest.raises(WiringError, match=advice):
         check_connection("a.y", a, "b.u", b)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "exponents"),
+    [
+        ("m/s^2", 1.0, {"m": 1, "s": -2}),
+        ("km", 1e3, {"m": 1}),
+        ("1/km^2", 1e-6, {"m": -2}),
+        ("mN*km", 1.0, {"kg": 1, "m": 2, "s": -2}),
+        ("g/cm^3", 1e3, {"kg": 1, "m": -3}),
+        ("deg/h", np.pi / 180 / 3600, {"rad": 1, "s": -1}),
+        ("rad^2*s", 1.0, {"rad": 2, "s": 1}),
+        ("m/s^0.5", None, None),  # FMI has whole exponents alone
+        ("px", None, None),
+    ],
+)
+def test_units_in_base_units_as_fmi_has_them(unit, factor, exponents):
+    found = base_units(unit)
+    if factor is None:
+        assert found is None
+    else:
+        assert found == (pytest.approx(factor, rel=1e-14), exponents)
 
 
 def factor(a, b):

@@ -132,12 +132,12 @@ def test_families_share_the_level_of_one_percent():
     unit = norm.ppf((np.arange(n) + 0.5) / n)[None, :, None]
     unit *= 1 / unit.std(ddof=1)
 
-    def words(p, level=0.01):
+    def words(p, **level):
         """Verdict on errors whose spread of an axis has this p, times two sides."""
         ratio = chi2.isf(p / 2, n - 1) / (n - 1) * EDGE**2
         statistics = Statistics(layout())
         statistics.add(block_of(layout(), history(np.sqrt(ratio) * unit, np.eye(1)), first=0))
-        return judge(statistics, level=level).words
+        return judge(statistics, **level).words
 
     assert words(0.0019) == ("overconfident",)
     assert words(0.0021) == ("consistent",)
@@ -166,6 +166,15 @@ def test_two_members_more_than_axes_are_judged():
         statistics = Statistics(layout(3))
         statistics.add(block_of(layout(3), history(e, np.eye(3)), first=0))
         assert judge(statistics).words == (word,)
+
+
+def test_epochs_with_too_few_members_are_not_tested():
+    """Of 6, 5 and 4 members left, three axes need 5: bias, both sides of spread, of each axis."""
+    e = np.random.default_rng(3).normal(size=(3, 6, 3))
+    e[1, 5:], e[2, 4:] = np.nan, np.nan
+    statistics = Statistics(layout(3, 3))
+    statistics.add(block_of(layout(3, 3), history(e, np.eye(3)), first=0))
+    assert judge(statistics).tests == 2 * (1 + 2 + 2 * 3)
 
 
 def test_means_over_epochs_count_every_value_and_intervals_what_is_independent():

@@ -122,6 +122,19 @@ def test_one_member_has_no_sample_sigma_and_still_is_json(toys):
     assert json.dumps(found)
 
 
+def test_predicted_sigma_is_the_root_mean_square_of_the_members(toys):
+    """Of 1 and 7 m that is 5 m."""
+
+    class Two(Error):
+        def _step_impl(self, t, dt):
+            self.position_error = self.x
+            self.position_sigma = (1.0 + 6.0 * self.environment.members)[:, None]
+
+    system = toys.wire({"truth": Truth(), "nav": Two()}, ["truth.x -> nav.x"], duration=1)
+    found = simulate(system, members=2).evaluation["position"]["sigma_predicted"]
+    assert found == [pytest.approx(5.0), pytest.approx(5.0)]
+
+
 def test_several_evaluations_are_kept_apart_by_path(toys):
     parts = {"truth": Truth(), "ekf": Error(), "ukf": Error(rate=Rate(2))}
     system = toys.wire(parts, ["truth.x -> ekf.x", "truth.x -> ukf.x"], duration=2)
