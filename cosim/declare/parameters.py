@@ -184,9 +184,8 @@ class Parameter(Setting[FloatArray]):
         if array.shape != self.shape:
             if array.ndim or not self._one_for_all(float(array)):
                 what = f"has shape {array.shape}" if array.ndim else "is one number"
-                axes = (
-                    "" if self.frame is None else f"\n  one for each axis of frame '{self.frame}'"
-                )
+                alone = not array.ndim and self.frame is not None
+                axes = f"\n  one for each axis of frame '{self.frame}'" if alone else ""
                 raise ConfigurationError(f"{where} {what}; {self._wanted()}{axes}")
             array = np.full(self.shape, float(array))
         array = self._convert(array, unit, where=where, bare=bare)

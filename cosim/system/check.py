@@ -243,16 +243,13 @@ def check_duration(duration: Fraction, base: Fraction) -> None:
     whole = duration // base
     if whole * base == duration:
         return
-    near = f"{text_seconds((whole + 1) * base)} s"
     if whole:
-        what, near = (
-            "which is no whole number of base steps",
-            f"{text_seconds(whole * base)} s or {near}",
-        )
+        near = [text_seconds(n * base) for n in (whole, whole + 1)]
+        what, give = "which is no whole number of base steps", f"{near[0]} s or {near[1]} s"
     else:
-        what = "shorter than the base step"
+        what, give = "shorter than the base step", "a longer one"
     raise RateError(
-        f"duration is {text_seconds(duration)} s, {what} of {text_seconds(base)} s\n  give {near}"
+        f"duration is {text_seconds(duration)} s, {what} of {text_seconds(base)} s\n  give {give}"
     )
 
 
