@@ -125,12 +125,12 @@ def test_one_member_has_no_sample_sigma_and_still_is_json(toys):
 def test_predicted_sigma_is_the_root_mean_square_of_the_members(toys):
     """Of 1 and 7 m that is 5 m."""
 
-    class Two(Error):
+    class UnevenError(Error):
         def _step_impl(self, t, dt):
             self.position_error = self.x
             self.position_sigma = (1.0 + 6.0 * self.environment.members)[:, None]
 
-    system = toys.wire({"truth": Truth(), "nav": Two()}, ["truth.x -> nav.x"], duration=1)
+    system = toys.wire({"truth": Truth(), "nav": UnevenError()}, ["truth.x -> nav.x"], duration=1)
     found = simulate(system, members=2).evaluation["position"]["sigma_predicted"]
     assert found == [pytest.approx(5.0), pytest.approx(5.0)]
 
