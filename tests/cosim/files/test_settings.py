@@ -1,5 +1,6 @@
 """A setting that would change nothing is refused, however it is given."""
 
+from math import radians
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,19 @@ def test_a_parameter_that_the_chosen_model_does_not_take_is_refused(settings, sa
 def test_with_the_choice_that_takes_it_the_same_parameter_is_set():
     system = tf.read_system(SYSTEM, [("orbit.drag", "true"), ("orbit.density", "1e-12 kg/m^3")])
     assert system.find("orbit").setting("density") == 1e-12
+
+
+@pytest.mark.parametrize(
+    ("settings", "misalignment_deg", "underweighted"),
+    [([], 0.01, 0), ([("case", "TC-2")], 0.01, 0), ([("case", "TC-1")], 0.1, 10)],
+)
+def test_a_choice_sets_what_stands_under_its_option(settings, misalignment_deg, underweighted):
+    """As the paper's test cases have it; TC-2 is the default."""
+    system = tf.read_system(SYSTEM, settings)
+    for owner in ("antenna", "predict"):
+        sigma = system.find(owner).setting("misalignment_sigma0")
+        assert sigma == pytest.approx(radians(misalignment_deg), rel=1e-15)
+    assert system.find("correct").setting("underweighted_updates") == underweighted
 
 
 def test_a_dispersion_of_it_is_refused():

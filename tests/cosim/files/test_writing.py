@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import terrafix as tf
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.files.readers import read_system
@@ -73,6 +74,15 @@ def test_what_is_read_is_written_as_it_was(tmp_path):
     file.write_text(FILE)
     write_system(read_system(file, outside=True), again)
     assert again.read_text() == FILE
+
+
+def test_a_relative_file_is_the_same_from_any_folder(tmp_path, monkeypatch):
+    """As it was given in Python, beside the folder that was the current one then."""
+    monkeypatch.chdir(tmp_path)
+    with System("relative", duration=1) as system:
+        system.add(tf.components.terrain(source="file", dem_file="N00E000.hgt"), "terrain")
+    text = system_text(system)
+    assert f'dem_file = "{tmp_path / "N00E000.hgt"}"' in text
 
 
 @pytest.fixture(scope="module")
