@@ -35,7 +35,11 @@ def configuration(plan: Plan) -> dict[str, Any]:
             for r in flat.records
         },
         "dispersions": {
-            d.name: {"kind": d.kind, "spread": str(d.spread), "to": list(d.targets)}
+            d.name: {
+                "kind": d.kind,
+                "spread": str(d.write_spread(flat.components)),  # every digit of every number
+                "to": list(d.targets),
+            }
             | ({"design": d.design} if d.design != "random" else {})
             | ({"limit": d.limit} if d.kind == "truncated" else {})
             for d in flat.dispersions

@@ -8,6 +8,7 @@ from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.identity import configuration
 from terrafix.cosim.system.system import System
 
 
@@ -111,6 +112,26 @@ def test_a_design_is_laid_out_over_all_runs_and_all_dispersions(toys, design):
     assert (np.sort(whole, axis=0) == np.arange(16)[:, None]).all()
     assert len({tuple(column) for column in whole.T}) == 4
     assert cells([9, 2]).tolist() == whole[[9, 2]].tolist()
+
+
+@pytest.mark.parametrize(
+    ("kind", "here", "there"),
+    [
+        ("normal", np.array([1.0, 0.1]), np.array([1.0, 0.1 + 1e-12])),
+        ("list", np.arange(4000.0).reshape(2000, 2), np.arange(4000.0).reshape(2000, 2) ** 1.0),
+    ],
+)
+def test_a_spread_is_part_of_what_a_run_is_to_the_last_digit(toys, kind, here, there):
+    """Not as NumPy prints it: with eight digits, and dots in the middle of a long list."""
+    if kind == "list":
+        there[1000] += 0.5
+    runs = [
+        configuration(pair(toys, Dispersion("d", ("ekf.start",), spread, kind)).check())
+        for spread in (here, there)
+    ]
+    assert runs[0] != runs[1]
+    same = configuration(pair(toys, Dispersion("d", ("ekf.start",), here.copy(), kind)).check())
+    assert runs[0] == same
 
 
 def test_units_and_dispersed_values_are_read_back_in_the_result(toys):
