@@ -28,7 +28,7 @@ from terrafix.cosim.declare.ports import Input, MessageOutput
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
-from terrafix.models.filters.spacecraft import REASONS as JUDGED
+from terrafix.models.filters.measurement import REASONS as JUDGED
 from terrafix.models.filters.spacecraft import navigation_error_array
 from terrafix.models.geometry.geolocation import track_axes
 from terrafix.models.images.matching import REASONS as MATCHED

@@ -49,7 +49,7 @@ INNOVATION = {
     "nis": Field((), "1", doc="normalized innovation squared, not underweighted"),
     "dof": Field((), "1", doc="number of elements used"),
     "accepted": Field((), "1", doc="1 if the fix corrected the estimate, else 0"),
-    "reason": Field((), "1", doc="index into terrafix.models.filters.spacecraft.REASONS"),
+    "reason": Field((), "1", doc="index into terrafix.models.filters.measurement.REASONS"),
 }
 """What a correction says about the fix it was given."""
 

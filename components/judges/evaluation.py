@@ -15,9 +15,9 @@ from terrafix.cosim.declare.evaluation import Evaluation, History, Quantity, con
 from terrafix.cosim.declare.ports import BundleInput, Input, MessageInput, Output
 from terrafix.models.core.model import Model
 from terrafix.models.filters.consistency import normalized_square
+from terrafix.models.filters.measurement import REASONS
 from terrafix.models.filters.spacecraft import (
-    ESTIMATE_FIELDS,
-    REASONS,
+    STATE,
     navigation_error,
     navigation_error_array,
 )
@@ -53,7 +53,7 @@ class NavigationEvaluation(Evaluation):
     nis = Output(doc="normalized innovation squared of this instant's fix, if accepted")
     nis_dof = Output(doc="elements in that fix")
     accepted = Output(doc="1 if that fix was accepted, 0 if not")
-    reason = Output(doc="index into terrafix.models.filters.spacecraft.REASONS")
+    reason = Output(doc="index into terrafix.models.filters.measurement.REASONS")
 
     def _initialize_impl(self) -> None:
         self._evaluate()
@@ -90,7 +90,7 @@ class NavigationEvaluation(Evaluation):
     def error_model(self) -> Model:
         """Errors of all quantities as a function of what the ports bring, for linearization."""
         inputs = {"r_e": (3, 1), "v_e": (3, 1), "q_mu": (4, 1)}
-        inputs |= {f"estimate.{name}": ESTIMATE_FIELDS[name] for name in ("r_e", "v_e", "q_mu")}
+        inputs |= {f"estimate.{name}": STATE.shapes[name] for name in ("r_e", "v_e", "q_mu")}
         symbols = {name: ca.SX.sym(name.replace(".", "_"), *s) for name, s in inputs.items()}
         return Model(
             "navigation_error",

@@ -23,6 +23,8 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -30,13 +32,14 @@ import casadi as ca
 from terrafix.models.core.batch import over_members
 from terrafix.models.core.model import Model, rk4
 from terrafix.models.core.symmetric import mirrored
-from terrafix.models.filters.updates import Measurement, update_rule
+from terrafix.models.filters.error_state import ErrorState, Values, rotation, vector
+from terrafix.models.filters.measurement import Observation, corrected
+from terrafix.models.filters.process import Process, propagate
+from terrafix.models.filters.updates import update_rule
 from terrafix.models.geometry.antenna import nominal_antenna
 from terrafix.models.geometry.frames import earth_rate_cross
 from terrafix.models.geometry.quaternion import (
-    from_rotation_vector,
     inverse,
-    normalized,
     product,
     rotation_matrix,
     rotation_vector,
@@ -50,25 +53,12 @@ TRANSITIONS = ("exact", "printed")
 JACOBIANS = ("exact", "wrong-sign")
 """Names of the derivatives of the measurement; the second is a negative control."""
 
-REASONS = (
-    "accepted",
-    "gate",
-    "innovation covariance not positive definite",
-    "nothing measured",
-    "not of this instant",
+STATE = ErrorState(
+    vector("r_e", unit="m", frame="e"),
+    vector("v_e", unit="m/s", frame="e"),
+    rotation("q_mu", side="left", frame="s"),
 )
-"""What became of a fix, indexed by ``innovation.reason``."""
-
-_SAME_INSTANT = 1e-6
-"""Largest difference of time between a fix and the prior that it corrects [s]."""
-
-ESTIMATE_FIELDS = {"r_e": (3, 1), "v_e": (3, 1), "q_mu": (4, 1), "P": (9, 9)}
-"""Shapes of the fields of an estimate."""
-
-
-def estimate_symbols(message: str) -> dict[str, Any]:
-    """Symbols of an estimate, keyed by field; named for `message`."""
-    return {k: ca.SX.sym(f"{message}_{k}", *shape) for k, shape in ESTIMATE_FIELDS.items()}
+"""Position, velocity, and the antenna's misalignment: nominal to actual axes."""
 
 
 def mekf_predict_model(gravity: str = "j2", transition: str = "exact") -> Model:
@@ -96,59 +86,106 @@ def mekf_predict_model(gravity: str = "j2", transition: str = "exact") -> Model:
     ValueError
         If a choice is not known.
     """
-    gravity_field = gravity_acceleration(gravity)
-    own, posterior = estimate_symbols("own"), estimate_symbols("posterior")
+    process = spacecraft_process(gravity, transition)
+    own, posterior = STATE.symbols("own"), STATE.symbols("posterior")
     fresh, dt = ca.SX.sym("posterior_fresh"), ca.SX.sym("dt")
-    delta_v_b, q_be = ca.SX.sym("delta_v_b", 3), ca.SX.sym("q_be", 4)
-    names = ("mu", "radius", "j2", "rotation_rate")
-    constants = {name: ca.SX.sym(name) for name in names}
-    mu, radius, j2, rate = constants.values()
-    noise_names = ("accel_psd", "misalignment_psd", "misalignment_sigma0")
-    noise = {name: ca.SX.sym(name) for name in noise_names}
-
-    def local_gravity(r: Any) -> Any:
-        """Gravity and centrifugal acceleration, eq. (9)."""
-        return gravity_field(r, mu, radius, j2) + rate * rate * ca.vertcat(r[0], r[1], 0)
-
+    inputs = {name: ca.SX.sym(name, size) for name, size in process.inputs.items()}
+    sigma0 = ca.SX.sym("misalignment_sigma0")
+    parameters = {name: ca.SX.sym(name, size) for name, size in process.named().items()}
     begin = {k: ca.if_else(fresh > 0.5, posterior[k], own[k]) for k in own}
-    r_end, v_end = _mechanized(
-        begin["r_e"], begin["v_e"], _earth_from_body(q_be, delta_v_b), local_gravity, rate, dt
-    )
-    r_middle = ca.SX.sym("r_middle", 3)
-    gradient = ca.Function(
-        "gradient",
-        [r_middle, *constants.values()],
-        [mirrored(ca.jacobian(local_gravity(r_middle), r_middle))],
-    )
-    G = gradient((begin["r_e"] + r_end) / 2, *constants.values())
-    phi = transition_matrix(G, rate, dt, transition)
-    P_end = _propagated(begin["P"], phi, noise["accel_psd"], noise["misalignment_psd"], dt)
+    moved = propagate(STATE, process, begin, {**inputs, **parameters}, dt, ca.SX(0))
     start = {
         "start.r_e": ca.SX.sym("start_r_e", 3),
         "start.v_e": ca.SX.sym("start_v_e", 3),
         "start.P": ca.SX.sym("start_P", 6, 6),
     }
-    variance0 = noise["misalignment_sigma0"] ** 2
     return Model(
         "mekf_predict",
         inputs={
-            "delta_v_b": delta_v_b,
-            "q_be": q_be,
+            **inputs,
             **{f"posterior.{k}": s for k, s in posterior.items()},
             "posterior.fresh": fresh,
             **start,
         },
         states=own,
-        parameters={**constants, **noise},
-        next={"r_e": r_end, "v_e": v_end, "q_mu": begin["q_mu"], "P": P_end},
+        parameters={**parameters, "misalignment_sigma0": sigma0},
+        next={**moved.values, "P": moved.covariance(begin["P"])},
         initial={
             "r_e": start["start.r_e"],
             "v_e": start["start.v_e"],
             "q_mu": ca.SX([0, 0, 0, 1]),
-            "P": ca.diagcat(mirrored(start["start.P"]), variance0 * ca.SX.eye(3)),
+            "P": ca.diagcat(mirrored(start["start.P"]), sigma0**2 * ca.SX.eye(3)),
         },
         outputs={f"prior.{k}": s for k, s in own.items()},
         step=dt,
+    )
+
+
+def spacecraft_process(gravity: str = "j2", transition: str = "exact") -> Process:
+    """Dead reckoning in Earth-fixed axes, with a closed form of its transition.
+
+    Parameters
+    ----------
+    gravity : {"j2", "two-body"}
+        Gravity field of the filter.
+    transition : {"exact", "printed", "derived"}
+        As of `transition_matrix`, or derived from the step: what the closed form is compared with.
+
+    Raises
+    ------
+    ValueError
+        If a choice is not known.
+    """
+    gravity_field = gravity_acceleration(gravity)
+    names = ("mu", "radius", "j2", "rotation_rate")
+
+    def local_gravity(r: Any, given: Values) -> Any:
+        """Gravity and centrifugal acceleration, eq. (9)."""
+        rate = given["rotation_rate"]
+        plain = gravity_field(r, given["mu"], given["radius"], given["j2"])
+        return plain + rate * rate * ca.vertcat(r[0], r[1], 0)
+
+    def step(values: Values, given: Values, dt: Any, _: Any) -> dict[str, Any]:
+        sensed = _earth_from_body(given["q_be"], given["delta_v_b"])
+        r, v = _mechanized(
+            values["r_e"],
+            values["v_e"],
+            sensed,
+            lambda r: local_gravity(r, given),
+            given["rotation_rate"],
+            dt,
+        )
+        return {"r_e": r, "v_e": v}
+
+    def closed(values: Values, end: Values, given: Values, dt: Any) -> Any:
+        r = ca.SX.sym("r_middle", 3)
+        constants = [given[name] for name in names]
+        symbols = {name: ca.SX.sym(name) for name in names}
+        gradient = ca.Function(
+            "gradient",
+            [r, *symbols.values()],
+            [mirrored(ca.jacobian(local_gravity(r, symbols), r))],
+        )
+        G = gradient((values["r_e"] + end["r_e"]) / 2, *constants)
+        phi = transition_matrix(G, given["rotation_rate"], dt, transition)
+        return ca.diagcat(phi, ca.SX.eye(3))
+
+    def spread(_: Values, __: Values, given: Values, dt: Any) -> Any:
+        """A white acceleration, of constant axes over a step."""
+        density, eye = given["accel_psd"], ca.SX.eye(3)
+        cross = density * dt * dt / 2 * eye
+        Q = ca.blockcat([[density * dt**3 / 3 * eye, cross], [cross, density * dt * eye]])
+        return ca.diagcat(Q, ca.SX(3, 3))
+
+    if transition not in (*TRANSITIONS, "derived"):
+        raise ValueError(f"transition must be one of {TRANSITIONS}, got '{transition}'")
+    return Process(
+        step=step,
+        walks={"q_mu": "misalignment_psd"},
+        inputs={"delta_v_b": 3, "q_be": 4},
+        parameters={**dict.fromkeys(names, 1), "accel_psd": 1},
+        transition=None if transition == "derived" else closed,
+        spread=spread,
     )
 
 
@@ -208,18 +245,6 @@ def transition_matrix(G: Any, rate: Any, dt: Any, transition: str = "exact") -> 
     return ca.blockcat([[rr, rv], [vr, vv]])
 
 
-def _propagated(P: Any, phi: Any, accel_psd: Any, misalignment_psd: Any, dt: Any) -> Any:
-    """Covariance (9, 9) after a step: white acceleration, walking misalignment."""
-    P = mirrored(P)
-    moved = ca.mtimes(phi, P[:6, :])
-    eye = ca.SX.eye(3)
-    cross = accel_psd * dt * dt / 2 * eye
-    Q = ca.blockcat([[accel_psd * dt**3 / 3 * eye, cross], [cross, accel_psd * dt * eye]])
-    state = ca.mtimes(moved[:, :6], phi.T) + Q
-    mount = P[6:, 6:] + misalignment_psd * dt * eye
-    return mirrored(ca.blockcat([[state, moved[:, 6:]], [moved[:, 6:].T, mount]]))
-
-
 def mekf_correct_model(
     update: str = "ekf", in_track: str = "speed", jacobian: str = "exact"
 ) -> Model:
@@ -264,14 +289,12 @@ def mekf_correct_model(
     if jacobian not in JACOBIANS:
         raise ValueError(f"jacobian must be one of {JACOBIANS}, got '{jacobian}'")
     rule = update_rule(update)
-    prior = estimate_symbols("prior")
-    shapes = {"y": (4, 1), "r_f_e": (3, 1), "R": (4, 4), "D": (3, 3), "present": (4, 1)}
-    fix = {k: ca.SX.sym(f"fix_{k}", *shape) for k, shape in shapes.items()}
+    observation = sar_observation(in_track)
+    prior, fix = STATE.symbols("prior"), observation.symbols("fix")
     fresh, q_be = ca.SX.sym("fix_fresh"), ca.SX.sym("q_be", 4)
     fix_t, time = ca.SX.sym("fix_t"), ca.SX.sym("time")
     names = ("look", "squint", "underweighting", "underweighted_updates")
     parameters = {name: ca.SX.sym(name) for name in names}
-    look, squint, underweighting, underweighted_updates = parameters.values()
     gate, n_updates = ca.SX.sym("gate", 4), ca.SX.sym("n_updates")
     inputs = {
         **{f"prior.{k}": s for k, s in prior.items()},
@@ -281,35 +304,25 @@ def mekf_correct_model(
         "q_be": q_be,
     }
 
-    q_sb = nominal_antenna(look, squint)
-    beta = ca.if_else(n_updates <= underweighted_updates, underweighting, 0.0)
+    beta = ca.if_else(
+        n_updates <= parameters["underweighted_updates"], parameters["underweighting"], 0.0
+    )
     arrived = fresh > 0.5
     fix["present"] = ca.if_else(arrived, fix["present"], 0.0)
-    measurement = _measurement(prior, fix, q_be, q_sb, in_track, jacobian)
-    outcome = rule(mirrored(prior["P"]), measurement, beta)
-    dof = ca.sum1(fix["present"] > 0.5)
-    threshold = sum(ca.if_else(dof == k + 1, gate[k], 0.0) for k in range(4))
-    reason = ca.if_else(
-        dof < 0.5,
-        REASONS.index("nothing measured"),
-        ca.if_else(
-            ca.logic_not(outcome.positive),
-            REASONS.index("innovation covariance not positive definite"),
-            ca.if_else(outcome.nis <= threshold, 0, REASONS.index("gate")),
-        ),
+    measurement = observation.about(STATE, prior, fix, {"q_be": q_be, **parameters})
+    if jacobian == "wrong-sign":
+        measurement = replace(measurement, jacobian=_wrong_sign(measurement.jacobian))
+    outcome = corrected(
+        STATE,
+        prior,
+        measurement,
+        rule,
+        gate=gate,
+        beta=beta,
+        lateness=fix_t - time,
+        recentered=update != "ekf",
     )
-    # between a pixel and a prior of another instant lie meters per millisecond
-    reason = ca.if_else(
-        ca.fabs(fix_t - time) <= _SAME_INSTANT, reason, REASONS.index("not of this instant")
-    )
-    accepted = ca.logic_and(arrived, reason == 0)
-    corrected = {
-        "r_e": prior["r_e"] + outcome.correction[:3],
-        "v_e": prior["v_e"] + outcome.correction[3:6],
-        "q_mu": normalized(product(from_rotation_vector(outcome.correction[6:]), prior["q_mu"])),
-        "P": outcome.P if update == "ekf" else _recentered(outcome.P, outcome.correction[6:]),
-    }
-    posterior = {k: ca.if_else(accepted, corrected[k], prior[k]) for k in prior}
+    accepted = ca.logic_and(arrived, outcome.accepted)
     return Model(
         f"mekf_correct_{update}_{in_track}" + ("" if jacobian == "exact" else "_wrong"),
         inputs=inputs,
@@ -318,66 +331,60 @@ def mekf_correct_model(
         next={"n_updates": n_updates + arrived},
         initial={"n_updates": ca.if_else(arrived, 1.0, 0.0)},
         outputs={
-            **{f"estimate.{k}": s for k, s in posterior.items()},
-            **{f"posterior.{k}": s for k, s in posterior.items()},
+            **{f"estimate.{k}": s for k, s in outcome.values.items()},
+            **{f"posterior.{k}": s for k, s in outcome.values.items()},
             "posterior.valid": accepted,
-            "innovation.residual": outcome.residual,
-            "innovation.sigma": ca.sqrt(ca.fmax(ca.diag(outcome.S), 0.0)),
-            "innovation.nis": outcome.nis,
-            "innovation.dof": dof,
+            "innovation.residual": outcome.update.residual,
+            "innovation.sigma": ca.sqrt(ca.fmax(ca.diag(outcome.update.S), 0.0)),
+            "innovation.nis": outcome.update.nis,
+            "innovation.dof": outcome.dof,
             "innovation.accepted": accepted,
             "innovation.valid": arrived,
-            "innovation.reason": reason,
+            "innovation.reason": outcome.reason,
         },
         time=time,
     )
 
 
-def _recentered(P: Any, dmu: Any) -> Any:
-    r"""Express a covariance (9, 9) about the corrected misalignment instead of the prior one.
+def _wrong_sign(jacobian: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    place = STATE.places["q_mu"].start
 
-    The error :math:`\delta` about the prior and :math:`\eta` about the estimate are related by
-    :math:`\delta q(\delta\mu + \delta) = \delta q(\eta) \otimes \delta q(\delta\mu)`.
+    def wrong(error: Any) -> Any:
+        H = jacobian(error)
+        return ca.horzcat(H[:, :place], -H[:, place:])
+
+    return wrong
+
+
+def sar_observation(in_track: str = "speed") -> Observation:
+    """The fix of a SAR image: two tangents, range and velocity to a pixel of uncertain position.
+
+    Parameters
+    ----------
+    in_track : {"speed", "effective"}
+        What the fourth element is.
     """
-    delta = ca.SX.sym("delta", 3)
-    corrected = from_rotation_vector(dmu)
-    turn = rotation_vector(product(from_rotation_vector(dmu + delta), inverse(corrected)))
-    by_delta = ca.substitute(ca.jacobian(turn, delta), delta, ca.SX.zeros(3))
-    J = ca.diagcat(ca.SX.eye(6), by_delta)
-    return mirrored(ca.mtimes(J, ca.mtimes(P, J.T)))
 
-
-def _measurement(
-    prior: Any, fix: Any, q_be: Any, q_sb: Any, in_track: str, jacobian: str
-) -> Measurement:
-    """Express the fix as a measurement of the error of the prior."""
-    error, pixel = ca.SX.sym("error", 9), ca.SX.sym("pixel", 3)
-    y = predicted_measurement(
-        prior["r_e"] + error[:3],
-        prior["v_e"] + error[3:6],
-        prior["q_mu"],
-        error[6:],
-        q_be,
-        q_sb,
-        pixel,
-        in_track,
-    )
-    by_error, by_pixel = ca.jacobian(y, error), ca.jacobian(y, pixel)
-    if jacobian == "wrong-sign":
-        by_error = ca.horzcat(by_error[:, :6], -by_error[:, 6:])
-
-    def at(expression: Any) -> Any:
-        return lambda e: ca.substitute(
-            expression, ca.vertcat(error, pixel), ca.vertcat(e, fix["r_f_e"])
+    def predict(values: Values, given: Values) -> Any:
+        return predicted_measurement(
+            values["r_e"],
+            values["v_e"],
+            values["q_mu"],
+            ca.SX.zeros(3),
+            given["q_be"],
+            nominal_antenna(given["look"], given["squint"]),
+            given["r_f_e"],
+            in_track,
         )
 
-    H_pixel = at(by_pixel)
-
-    def noise(e: Any) -> Any:
-        H = H_pixel(e)
-        return fix["R"] + ca.mtimes(H, ca.mtimes(fix["D"], H.T))
-
-    return Measurement(fix["y"], at(y), at(by_error), noise, fix["present"])
+    return Observation(
+        predict,
+        4,
+        fields={"r_f_e": 3},
+        mapped={"r_f_e": "D"},
+        inputs={"q_be": 4},
+        parameters={"look": 1, "squint": 1},
+    )
 
 
 def navigation_error(

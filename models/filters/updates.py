@@ -10,6 +10,9 @@ pixel's position; and underweighting by a factor :math:`\beta`, Lear's device,
 which enlarges the gain's covariance and the posterior's, not the one by which the innovation is
 judged.
 
+Elements of the error that are only considered (a Schmidt filter's) have a gain of zero; the
+covariances below hold for any gain.
+
 A measurement says which of its elements are angles: a bearing of 3.1 rad that was predicted as
 -3.1 rad is off by 0.08 rad, not by 6.2.
 
@@ -26,7 +29,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import pi
 from typing import Any
@@ -140,9 +143,12 @@ def _judged(residual: Any, S: Any) -> tuple[Any, Any]:
     return ca.dot(residual, ldl_solve(L, d, residual)), positive
 
 
-def _gain(P_xy: Any, S: Any) -> tuple[Any, Any]:
+def _gain(P_xy: Any, S: Any, considered: Sequence[int]) -> tuple[Any, Any]:
     L, d, positive = ldl(S, _FLOOR)
-    return ldl_solve(L, d, P_xy.T).T, positive
+    K = ldl_solve(L, d, P_xy.T).T
+    for k in considered:
+        K[k, :] = 0
+    return K, positive
 
 
 def _joseph(P: Any, H: Any, K: Any, R: Any) -> Any:
@@ -152,7 +158,9 @@ def _joseph(P: Any, H: Any, K: Any, R: Any) -> Any:
     return mirrored(kept + ca.mtimes(K, ca.mtimes(R, K.T)))
 
 
-def ekf_update(P: Any, measurement: Measurement, beta: Any) -> Update:
+def ekf_update(
+    P: Any, measurement: Measurement, beta: Any, considered: Sequence[int] = ()
+) -> Update:
     """Linearize once, at the prior: eqs. (35)-(43) of [1]_.
 
     Parameters
@@ -163,6 +171,8 @@ def ekf_update(P: Any, measurement: Measurement, beta: Any) -> Update:
         The measurement about the prior.
     beta : SX
         Factor of underweighting.
+    considered : sequence of int
+        Elements of the error that are not corrected.
     """
     zero = ca.SX.zeros(P.shape[0])
     residual, R = measurement.residual(zero), measurement.covariance(zero)
@@ -171,7 +181,7 @@ def ekf_update(P: Any, measurement: Measurement, beta: Any) -> Update:
     P_yy = mirrored(ca.mtimes(H, P_xy))
     S = P_yy + R
     nis, positive = _judged(residual, S)
-    K, solvable = _gain(P_xy, S + beta * P_yy)
+    K, solvable = _gain(P_xy, S + beta * P_yy, considered)
     return Update(
         correction=ca.mtimes(K, residual),
         P=_joseph(P, H, K, beta * P_yy + R),
@@ -182,20 +192,22 @@ def ekf_update(P: Any, measurement: Measurement, beta: Any) -> Update:
     )
 
 
-def iterated_update(P: Any, measurement: Measurement, beta: Any) -> Update:
+def iterated_update(
+    P: Any, measurement: Measurement, beta: Any, considered: Sequence[int] = ()
+) -> Update:
     """Linearize again about each iterate: Gauss-Newton for the most probable state, [2]_.
 
     A fixed number of iterations; the innovation is judged as in `ekf_update`, at the prior.
     Parameters as there.
     """
-    first = ekf_update(P, measurement, beta)
+    first = ekf_update(P, measurement, beta, considered)
     error, positive = first.correction, first.positive
     for _ in range(_ITERATIONS - 1):
-        H, K, solvable, R = _linearized(P, measurement, beta, error)
+        H, K, solvable, R = _linearized(P, measurement, beta, error, considered)
         innovation = measurement.residual(error) + ca.mtimes(H, error)
         error = ca.mtimes(K, innovation)
         positive = ca.logic_and(positive, solvable)
-    H, K, solvable, R = _linearized(P, measurement, beta, error)
+    H, K, solvable, R = _linearized(P, measurement, beta, error, considered)
     return Update(
         correction=error,
         P=_joseph(P, H, K, R),
@@ -206,17 +218,21 @@ def iterated_update(P: Any, measurement: Measurement, beta: Any) -> Update:
     )
 
 
-def _linearized(P: Any, measurement: Measurement, beta: Any, error: Any) -> tuple[Any, ...]:
+def _linearized(
+    P: Any, measurement: Measurement, beta: Any, error: Any, considered: Sequence[int]
+) -> tuple[Any, ...]:
     """Jacobian, gain, whether it exists, and the noise of the Joseph form, at an error."""
     H, R = measurement.sensitivity(error), measurement.covariance(error)
     P_xy = ca.mtimes(P, H.T)
     P_yy = mirrored(ca.mtimes(H, P_xy))
     R = beta * P_yy + R
-    K, solvable = _gain(P_xy, P_yy + R)
+    K, solvable = _gain(P_xy, P_yy + R, considered)
     return H, K, solvable, R
 
 
-def unscented_update(P: Any, measurement: Measurement, beta: Any) -> Update:
+def unscented_update(
+    P: Any, measurement: Measurement, beta: Any, considered: Sequence[int] = ()
+) -> Update:
     r"""Propagate sigma points of the error through the measurement.
 
     The 2 n equally weighted points of [3]_ (no weight is negative). With :math:`P = L L^T` and
@@ -252,7 +268,7 @@ def unscented_update(P: Any, measurement: Measurement, beta: Any) -> Update:
     R = measurement.covariance(zero)
     S = P_yy + R
     nis, positive = _judged(residual, S)
-    K, solvable = _gain(ca.mtimes(root, M.T), S + beta * P_yy)
+    K, solvable = _gain(ca.mtimes(root, M.T), S + beta * P_yy, considered)
     kept = root - ca.mtimes(K, M)
     noise = second + beta * P_yy + R
     return Update(
@@ -265,7 +281,7 @@ def unscented_update(P: Any, measurement: Measurement, beta: Any) -> Update:
     )
 
 
-def update_rule(name: str) -> Callable[[Any, Measurement, Any], Update]:
+def update_rule(name: str) -> Callable[..., Update]:
     """Choose an update by name.
 
     Raises

@@ -11,7 +11,7 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import BundleOutput, MessageOutput, Output
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.system.system import System
-from terrafix.models.filters.spacecraft import REASONS
+from terrafix.models.filters.measurement import REASONS
 
 SIGMA = np.array([100.0, 200.0, 300.0, 1.0, 2.0, 3.0, 1e-3, 2e-3, 3e-3])
 ERROR = np.array([1.0, -2.0, 0.5])  # in sigma, of position, velocity and misalignment alike

@@ -17,7 +17,7 @@ from terrafix.cosim.declare.ports import MessageOutput, Output
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.cosim.system.system import System
-from terrafix.models.filters.spacecraft import REASONS
+from terrafix.models.filters.measurement import REASONS
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.quaternion import inverse_array, product_array, rotation_vector_array
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from terrafix.models.filters.spacecraft import REASONS, mekf_correct_model
+from terrafix.models.filters.measurement import REASONS
+from terrafix.models.filters.spacecraft import mekf_correct_model
 from terrafix.models.geometry.antenna import nominal_antenna
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.quaternion import (

@@ -1,0 +1,302 @@
+r"""What a filter estimates, and the coordinates of its error: blocks, one after the other.
+
+The error :math:`e` of an estimate :math:`\hat x` is truth minus estimate, in the sense of
+
+.. math::
+    x = \hat x \oplus e, \qquad e = x \ominus \hat x,
+
+block by block: a vector adds, :math:`x = \hat x + e`; a rotation is a unit quaternion
+(`terrafix.models.geometry.quaternion`) whose error is a rotation vector :math:`\theta`, in the
+axes that it leads to (left) or those that it comes from (right),
+
+.. math::
+    q = \delta q(\theta) \otimes \hat q \quad\text{or}\quad q = \hat q \otimes \delta q(\theta).
+
+A covariance is that of :math:`e` about one estimate. About another, :math:`\hat x' = \hat x \oplus
+c`, the error is :math:`e' = (\hat x \oplus e) \ominus \hat x'`, and its covariance
+:math:`J P J^T` with :math:`J = \partial e' / \partial e` at :math:`e = c`: the identity for
+vectors, not for rotations (`ErrorState.recentering`).
+
+References
+----------
+.. [1] C. Hertzberg, R. Wagner, U. Frese, L. Schroeder, "Integrating generic sensor fusion
+       algorithms with sound state representations through encapsulation of manifolds",
+       Information Fusion 14(1), 2013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+
+from terrafix.models.core.symmetric import mirrored
+from terrafix.models.geometry.quaternion import (
+    IDENTITY,
+    from_rotation_vector,
+    inverse,
+    normalized,
+    product,
+    rotation_vector,
+)
+
+Values = Mapping[str, Any]
+"""Of the blocks by name: columns of symbols, (4, 1) of a rotation."""
+
+SIDES = ("left", "right")
+"""Of a rotation's error: in the axes it leads to, or in those it comes from."""
+
+XYZ = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A part of what is estimated.
+
+    Parameters
+    ----------
+    name : str
+        An identifier; the estimate's field, and a part of the names of its parameters.
+    size : int
+        Of its error.
+    unit : str
+        Of its error; a rotation's value has none.
+    frame : str, optional
+    labels : tuple of str
+        Of the elements of its error; x, y, z of three, else their numbers, nothing of one.
+    side : {"", "left", "right"}
+        Of a rotation; empty for a vector.
+    considered : bool
+        It counts in every covariance, and is never corrected.
+    clone_of : str
+        The block of which it is a copy at an earlier instant.
+    """
+
+    name: str
+    size: int = 3
+    unit: str = "1"
+    frame: str | None = None
+    labels: tuple[str, ...] = ()
+    side: str = ""
+    considered: bool = False
+    clone_of: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier():
+            raise ValueError(f"'{self.name}' cannot name a block: use letters, digits, underscores")
+        if self.size < 1:
+            raise ValueError(f"block '{self.name}' has size {self.size}; it has 1 element or more")
+        if self.labels and len(self.labels) != self.size:
+            raise ValueError(
+                f"block '{self.name}' has {len(self.labels)} labels for {self.size} elements"
+            )
+
+    @property
+    def is_rotation(self) -> bool:
+        """Whether its value is a quaternion."""
+        return bool(self.side)
+
+    @property
+    def value_size(self) -> int:
+        """Number of elements of its value."""
+        return 4 if self.is_rotation else self.size
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Labels of the elements of its error."""
+        if self.labels:
+            return self.labels
+        if self.size == 1:
+            return ("",)
+        return XYZ if self.size == 3 else tuple(str(k + 1) for k in range(self.size))
+
+    def plus(self, value: Any, error: Any) -> Any:
+        """Retract: the value that is off by an error."""
+        if not self.is_rotation:
+            return value + error
+        turn = from_rotation_vector(error)
+        return product(turn, value) if self.side == "left" else product(value, turn)
+
+    def minus(self, value: Any, other: Any) -> Any:
+        """Difference: the error that takes `other` to `value`."""
+        if not self.is_rotation:
+            return value - other
+        if self.side == "left":
+            return rotation_vector(product(value, inverse(other)))
+        return rotation_vector(product(inverse(other), value))
+
+    def start(self) -> Any:
+        """What it is where nothing is known: zero, or no rotation."""
+        return ca.SX(list(IDENTITY)) if self.is_rotation else ca.SX.zeros(self.size)
+
+
+def vector(
+    name: str,
+    size: int = 3,
+    *,
+    unit: str = "1",
+    frame: str | None = None,
+    labels: Sequence[str] = (),
+) -> Block:
+    """A block that adds: a position, a bias, a constant."""
+    return Block(name, size, unit, frame, tuple(labels))
+
+
+def rotation(name: str, *, side: str, frame: str | None = None) -> Block:
+    """A block that is a unit quaternion; its error is a rotation vector [rad].
+
+    Raises
+    ------
+    ValueError
+        If the side is neither of `SIDES`.
+    """
+    if side not in SIDES:
+        raise ValueError(
+            f"the error of rotation '{name}' is on the side '{side}'; it is on the left (in the "
+            "axes it leads to) or on the right (in those it comes from)"
+        )
+    return Block(name, 3, "rad", frame, side=side)
+
+
+def considered(block: Block) -> Block:
+    """The same block, in every covariance and never corrected: a Schmidt filter's."""
+    return replace(block, considered=True)
+
+
+def clone(block: Block, name: str) -> Block:
+    """A copy of a block at an instant, under a name of its own; it stays as it was then."""
+    return replace(block, name=name, clone_of=block.name)
+
+
+@dataclass(frozen=True)
+class ErrorState:
+    """Blocks in their order: what is estimated, and the coordinates of its error.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+
+    Raises
+    ------
+    ValueError
+        If there is none, names clash, or a clone is of no block.
+    """
+
+    blocks: tuple[Block, ...]
+
+    def __init__(self, *blocks: Block) -> None:
+        object.__setattr__(self, "blocks", tuple(blocks))
+        names = [block.name for block in blocks]
+        if not names:
+            raise ValueError("an error state has one block or more")
+        twice = sorted({name for name in names if names.count(name) > 1} | {"P", "t"} & set(names))
+        if twice:
+            raise ValueError(
+                f"two things of an error state are called '{twice[0]}'; blocks have names of their "
+                "own, and P is the covariance, t the time"
+            )
+        for block in blocks:
+            of = next((b for b in blocks if b.name == block.clone_of), None)
+            if block.clone_of and (of is None or of.value_size != block.value_size):
+                raise ValueError(
+                    f"'{block.name}' is a clone of '{block.clone_of}', which is no block like it; "
+                    f"the blocks are {', '.join(names)}"
+                )
+
+    def __iter__(self) -> Iterator[Block]:
+        return iter(self.blocks)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of elements of the error."""
+        return sum(block.size for block in self.blocks)
+
+    @cached_property
+    def places(self) -> dict[str, slice]:
+        """Where each block's error lies."""
+        found, at = {}, 0
+        for block in self.blocks:
+            found[block.name] = slice(at, at + block.size)
+            at += block.size
+        return found
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of all elements of the error: ``"r_e x"``."""
+        return tuple(f"{b.name} {axis}".rstrip() for b in self.blocks for axis in b.axes)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each element of the error."""
+        return tuple(block.unit for block in self.blocks for _ in range(block.size))
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, int]]:
+        """Shapes of the fields of an estimate: values, and the covariance P."""
+        values = {block.name: (block.value_size, 1) for block in self.blocks}
+        return values | {"P": (self.size, self.size)}
+
+    def symbols(self, name: str) -> dict[str, Any]:
+        """Symbols of an estimate by field, named for `name`."""
+        return {k: ca.SX.sym(f"{name}_{k}", *shape) for k, shape in self.shapes.items()}
+
+    def part(self, error: Any, name: str) -> Any:
+        """Rows of a block in an error, or in a matrix of which each row is an element's."""
+        place = self.places[name]
+        return error[place.start : place.stop, :]
+
+    def retract(self, values: Values, error: Any) -> dict[str, Any]:
+        """Values that are off by an error (n, 1)."""
+        return {b.name: b.plus(values[b.name], self.part(error, b.name)) for b in self.blocks}
+
+    def normalized(self, values: Values) -> dict[str, Any]:
+        """Values whose quaternions are of unit length, which they lose by and by to rounding."""
+        return {
+            b.name: normalized(values[b.name]) if b.is_rotation else values[b.name]
+            for b in self.blocks
+        }
+
+    def difference(self, values: Values, others: Values) -> Any:
+        """The error (n, 1) that takes `others` to `values`."""
+        return ca.vertcat(*(b.minus(values[b.name], others[b.name]) for b in self.blocks))
+
+    def recentering(self, correction: Any) -> Any:
+        """Derivative (n, n) of the error about a corrected estimate by that about the prior.
+
+        At the correction (n, 1) itself, where the first is zero. A rotation's is that of the
+        rotation vectors alone, and the same on either side but for its transpose.
+        """
+        parts = []
+        for block in self.blocks:
+            if not block.is_rotation:
+                parts.append(ca.SX.eye(block.size))
+                continue
+            own, delta = self.part(correction, block.name), ca.SX.sym("delta", 3)
+            about, off = from_rotation_vector(own), from_rotation_vector(own + delta)
+            turn = rotation_vector(
+                product(off, inverse(about))
+                if block.side == "left"
+                else product(inverse(about), off)
+            )
+            parts.append(ca.substitute(ca.jacobian(turn, delta), delta, ca.SX.zeros(3)))
+        return ca.diagcat(*parts)
+
+    def recentered(self, P: Any, correction: Any) -> Any:
+        """A covariance (n, n) about the corrected estimate, from that about the prior."""
+        if not any(block.is_rotation for block in self.blocks):
+            return P
+        J = self.recentering(correction)
+        return mirrored(ca.mtimes(J, ca.mtimes(P, J.T)))
+
+    @property
+    def kept(self) -> tuple[int, ...]:
+        """Elements of the error that no measurement corrects: of considered blocks."""
+        return tuple(
+            k
+            for b in self.blocks
+            if b.considered
+            for k in range(self.places[b.name].start, self.places[b.name].stop)
+        )

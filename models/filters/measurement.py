@@ -1,0 +1,236 @@
+r"""A measurement of an estimate, and its correction by it: update, underweighting, gate, reasons.
+
+An observation says what would be measured at values of the blocks, :math:`h(x, u)`; its derivative
+by the error follows. Its noise is the one it reports, :math:`R`, and that of what else the message
+holds: a field :math:`p` with a covariance :math:`D` of its own (the position of a pixel, say) is
+mapped by the derivative,
+
+.. math::
+    R' = R + H_p D H_p^T, \qquad H_p = \frac{\partial h}{\partial p}.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+
+from terrafix.models.core.symmetric import mirrored
+from terrafix.models.filters.error_state import ErrorState, Values
+from terrafix.models.filters.updates import Measurement, Update
+
+REASONS = (
+    "accepted",
+    "gate",
+    "innovation covariance not positive definite",
+    "nothing measured",
+    "not of this instant",
+)
+"""What became of a fix, indexed by ``innovation.reason``."""
+
+SAME_INSTANT = 1e-6
+"""Largest difference of time between a fix and the prior that it corrects [s]."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a sensor would measure, as a function of the blocks.
+
+    Parameters
+    ----------
+    predict : callable
+        Of the values of the blocks, and of inputs, parameters and the message's fields, by name:
+        what is measured, (m, 1).
+    size : int
+        m.
+    fields : mapping of str to int
+        Sizes of the message's further fields, of which `predict` may make use.
+    mapped : mapping of str to str
+        Further fields that are not exactly known: the field that holds the covariance of each.
+    angles : tuple of int
+        Elements that are angles [rad].
+    inputs, parameters : mapping of str to int
+        Sizes of what else it reads.
+
+    Raises
+    ------
+    ValueError
+        If a mapped field is none of the message's.
+    """
+
+    predict: Callable[[Values, Values], Any]
+    size: int
+    fields: Mapping[str, int] = field(default_factory=dict)
+    mapped: Mapping[str, str] = field(default_factory=dict)
+    angles: tuple[int, ...] = ()
+    inputs: Mapping[str, int] = field(default_factory=dict)
+    parameters: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in self.mapped:
+            if name not in self.fields:
+                raise ValueError(
+                    f"an observation maps the error of '{name}', which is no field of its message;"
+                    f" the fields are {', '.join(self.fields) or 'none'}"
+                )
+        wrong = [k for k in self.angles if not 0 <= k < self.size]
+        if wrong:
+            raise ValueError(
+                f"element {wrong[0]} is an angle, but {self.size} elements are measured, from 0 on"
+            )
+
+    def shapes(self) -> dict[str, tuple[int, int]]:
+        """Shapes of the message's fields."""
+        m = self.size
+        found = {"y": (m, 1)} | {name: (size, 1) for name, size in self.fields.items()}
+        found["R"] = (m, m)
+        for name, covariance in self.mapped.items():
+            found[covariance] = (self.fields[name], self.fields[name])
+        return found | {"present": (m, 1)}
+
+    def symbols(self, name: str) -> dict[str, Any]:
+        """Symbols of the message by field, named for `name`."""
+        return {k: ca.SX.sym(f"{name}_{k}", *shape) for k, shape in self.shapes().items()}
+
+    def about(
+        self, state: ErrorState, prior: Values, message: Values, given: Values
+    ) -> Measurement:
+        """The measurement as a function of the error of the prior.
+
+        Parameters
+        ----------
+        state : ErrorState
+        prior : mapping of str to SX
+            Values by block.
+        message : mapping of str to SX
+            By field, absent elements marked.
+        given : mapping of str to SX
+            Inputs and parameters.
+
+        Raises
+        ------
+        ValueError
+            If what is predicted has another size.
+        """
+        error = ca.SX.sym("error", state.size)
+        uncertain = {name: ca.SX.sym(name, self.fields[name]) for name in self.mapped}
+        told = {name: message[name] for name in self.fields} | uncertain
+        y = ca.SX(self.predict(state.retract(prior, error), {**given, **told}))
+        if y.shape != (self.size, 1):
+            raise ValueError(
+                f"an observation predicts an array of shape {y.shape}; it measures {self.size} "
+                "elements"
+            )
+        symbols = ca.vertcat(error, *uncertain.values())
+        reported = [message[name] for name in uncertain]
+
+        def at(expression: Any) -> Callable[[Any], Any]:
+            return lambda e: ca.substitute(expression, symbols, ca.vertcat(e, *reported))
+
+        by_field = [at(ca.jacobian(y, symbol)) for symbol in uncertain.values()]
+
+        def noise(e: Any) -> Any:
+            total = message["R"]
+            for derivative, covariance in zip(by_field, self.mapped.values(), strict=True):
+                H = derivative(e)
+                total = total + ca.mtimes(H, ca.mtimes(message[covariance], H.T))
+            return total
+
+        return Measurement(
+            message["y"],
+            at(y),
+            at(ca.jacobian(y, error)),
+            noise,
+            message["present"],
+            self.angles,
+        )
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What a fix did to an estimate, as expressions.
+
+    Attributes
+    ----------
+    values : dict of str to SX
+        The posterior where it was accepted, else the prior; with ``P``.
+    accepted, reason : SX
+        1 or 0; index into `REASONS`.
+    dof : SX
+        Number of elements measured.
+    update : Update
+    """
+
+    values: dict[str, Any]
+    accepted: Any
+    reason: Any
+    dof: Any
+    update: Update
+
+
+def corrected(
+    state: ErrorState,
+    prior: Values,
+    measurement: Measurement,
+    rule: Callable[..., Update],
+    *,
+    gate: Any,
+    beta: Any = 0.0,
+    lateness: Any = 0.0,
+    recentered: bool = True,
+) -> Correction:
+    """Correct a prior by a measurement, where it passes the gate.
+
+    Parameters
+    ----------
+    state : ErrorState
+    prior : mapping of str to SX
+        Values by block, and ``P``.
+    measurement : Measurement
+        About the prior; no element present where there is no fix.
+    rule : callable
+        One of `terrafix.models.filters.updates`.
+    gate : SX, shape (m, 1)
+        Largest NIS accepted with 1 to m elements.
+    beta : SX
+        Factor of underweighting.
+    lateness : SX
+        Time of the fix minus that of the prior [s].
+    recentered : bool
+        Express the covariance about the posterior; else it stays about the prior, an error of
+        second order in the correction of rotations.
+
+    Raises
+    ------
+    ValueError
+        If the gate is for another number of elements.
+    """
+    m = measurement.y.shape[0]
+    if ca.SX(gate).shape != (m, 1):
+        raise ValueError(
+            f"a gate for {ca.SX(gate).numel()} elements, of a measurement that has {m}: give the "
+            "largest NIS accepted with 1, 2, ... of them"
+        )
+    outcome = rule(mirrored(prior["P"]), measurement, beta, state.kept)
+    dof = ca.sum1(measurement.present > 0.5)
+    threshold = sum(ca.if_else(dof == k + 1, gate[k], 0.0) for k in range(m))
+    reason = ca.if_else(
+        dof < 0.5,
+        REASONS.index("nothing measured"),
+        ca.if_else(
+            ca.logic_not(outcome.positive),
+            REASONS.index("innovation covariance not positive definite"),
+            ca.if_else(outcome.nis <= threshold, 0, REASONS.index("gate")),
+        ),
+    )
+    # between what was measured and a prior of another instant lie meters per millisecond
+    reason = ca.if_else(
+        ca.fabs(lateness) <= SAME_INSTANT, reason, REASONS.index("not of this instant")
+    )
+    accepted = reason == 0
+    P = state.recentered(outcome.P, outcome.correction) if recentered else outcome.P
+    posterior = {**state.normalized(state.retract(prior, outcome.correction)), "P": P}
+    values = {k: ca.if_else(accepted, posterior[k], prior[k]) for k in posterior}
+    return Correction(values, accepted, reason, dof, outcome)
