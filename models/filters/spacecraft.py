@@ -23,7 +23,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -33,9 +32,10 @@ from terrafix.models.core.batch import over_members
 from terrafix.models.core.model import Model, rk4
 from terrafix.models.core.symmetric import mirrored
 from terrafix.models.filters.error_state import ErrorState, Values, rotation, vector
-from terrafix.models.filters.measurement import Observation, corrected
-from terrafix.models.filters.process import Process, propagate
-from terrafix.models.filters.updates import update_rule
+from terrafix.models.filters.measurement import Observation
+from terrafix.models.filters.models import correct_model, predict_model
+from terrafix.models.filters.process import Process
+from terrafix.models.filters.updates import Measurement
 from terrafix.models.geometry.antenna import nominal_antenna
 from terrafix.models.geometry.frames import earth_rate_cross
 from terrafix.models.geometry.quaternion import (
@@ -86,38 +86,12 @@ def mekf_predict_model(gravity: str = "j2", transition: str = "exact") -> Model:
     ValueError
         If a choice is not known.
     """
-    process = spacecraft_process(gravity, transition)
-    own, posterior = STATE.symbols("own"), STATE.symbols("posterior")
-    fresh, dt = ca.SX.sym("posterior_fresh"), ca.SX.sym("dt")
-    inputs = {name: ca.SX.sym(name, size) for name, size in process.inputs.items()}
-    sigma0 = ca.SX.sym("misalignment_sigma0")
-    parameters = {name: ca.SX.sym(name, size) for name, size in process.named().items()}
-    begin = {k: ca.if_else(fresh > 0.5, posterior[k], own[k]) for k in own}
-    moved = propagate(STATE, process, begin, {**inputs, **parameters}, dt, ca.SX(0))
-    start = {
-        "start.r_e": ca.SX.sym("start_r_e", 3),
-        "start.v_e": ca.SX.sym("start_v_e", 3),
-        "start.P": ca.SX.sym("start_P", 6, 6),
-    }
-    return Model(
+    return predict_model(
         "mekf_predict",
-        inputs={
-            **inputs,
-            **{f"posterior.{k}": s for k, s in posterior.items()},
-            "posterior.fresh": fresh,
-            **start,
-        },
-        states=own,
-        parameters={**parameters, "misalignment_sigma0": sigma0},
-        next={**moved.values, "P": moved.covariance(begin["P"])},
-        initial={
-            "r_e": start["start.r_e"],
-            "v_e": start["start.v_e"],
-            "q_mu": ca.SX([0, 0, 0, 1]),
-            "P": ca.diagcat(mirrored(start["start.P"]), sigma0**2 * ca.SX.eye(3)),
-        },
-        outputs={f"prior.{k}": s for k, s in own.items()},
-        step=dt,
+        STATE,
+        spacecraft_process(gravity, transition),
+        told=("r_e", "v_e"),
+        sigmas={"q_mu": "misalignment_sigma0"},
     )
 
 
@@ -278,7 +252,8 @@ def mekf_correct_model(
         ``posterior.valid``; ``innovation.residual`` (4,), ``innovation.sigma`` (4,),
         ``innovation.nis``, ``innovation.dof``, the number of elements present,
         ``innovation.accepted``, ``innovation.valid``, and ``innovation.reason``, one of
-        `REASONS`. Residual and sigma are zero and one for absent elements and without a fix; the
+        `terrafix.models.filters.measurement.REASONS`. Residual and sigma are zero and one for
+        absent elements and without a fix; the
         normalized innovation squared is that of the covariance without underweighting.
 
     Raises
@@ -288,72 +263,24 @@ def mekf_correct_model(
     """
     if jacobian not in JACOBIANS:
         raise ValueError(f"jacobian must be one of {JACOBIANS}, got '{jacobian}'")
-    rule = update_rule(update)
-    observation = sar_observation(in_track)
-    prior, fix = STATE.symbols("prior"), observation.symbols("fix")
-    fresh, q_be = ca.SX.sym("fix_fresh"), ca.SX.sym("q_be", 4)
-    fix_t, time = ca.SX.sym("fix_t"), ca.SX.sym("time")
-    names = ("look", "squint", "underweighting", "underweighted_updates")
-    parameters = {name: ca.SX.sym(name) for name in names}
-    gate, n_updates = ca.SX.sym("gate", 4), ca.SX.sym("n_updates")
-    inputs = {
-        **{f"prior.{k}": s for k, s in prior.items()},
-        **{f"fix.{k}": s for k, s in fix.items()},
-        "fix.fresh": fresh,
-        "fix.t": fix_t,
-        "q_be": q_be,
-    }
-
-    beta = ca.if_else(
-        n_updates <= parameters["underweighted_updates"], parameters["underweighting"], 0.0
-    )
-    arrived = fresh > 0.5
-    fix["present"] = ca.if_else(arrived, fix["present"], 0.0)
-    measurement = observation.about(STATE, prior, fix, {"q_be": q_be, **parameters})
-    if jacobian == "wrong-sign":
-        measurement = replace(measurement, jacobian=_wrong_sign(measurement.jacobian))
-    outcome = corrected(
-        STATE,
-        prior,
-        measurement,
-        rule,
-        gate=gate,
-        beta=beta,
-        lateness=fix_t - time,
-        recentered=update != "ekf",
-    )
-    accepted = ca.logic_and(arrived, outcome.accepted)
-    return Model(
+    return correct_model(
         f"mekf_correct_{update}_{in_track}" + ("" if jacobian == "exact" else "_wrong"),
-        inputs=inputs,
-        states={"n_updates": n_updates},
-        parameters={**parameters, "gate": gate},
-        next={"n_updates": n_updates + arrived},
-        initial={"n_updates": ca.if_else(arrived, 1.0, 0.0)},
-        outputs={
-            **{f"estimate.{k}": s for k, s in outcome.values.items()},
-            **{f"posterior.{k}": s for k, s in outcome.values.items()},
-            "posterior.valid": accepted,
-            "innovation.residual": outcome.update.residual,
-            "innovation.sigma": ca.sqrt(ca.fmax(ca.diag(outcome.update.S), 0.0)),
-            "innovation.nis": outcome.update.nis,
-            "innovation.dof": outcome.dof,
-            "innovation.accepted": accepted,
-            "innovation.valid": arrived,
-            "innovation.reason": outcome.reason,
-        },
-        time=time,
+        STATE,
+        sar_observation(in_track),
+        update,
+        recentered=update != "ekf",
+        altered=None if jacobian == "exact" else _wrong_sign,
     )
 
 
-def _wrong_sign(jacobian: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def _wrong_sign(measurement: Measurement) -> Measurement:
     place = STATE.places["q_mu"].start
 
     def wrong(error: Any) -> Any:
-        H = jacobian(error)
+        H = measurement.jacobian(error)
         return ca.horzcat(H[:, :place], -H[:, place:])
 
-    return wrong
+    return replace(measurement, jacobian=wrong)
 
 
 def sar_observation(in_track: str = "speed") -> Observation:
