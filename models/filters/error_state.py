@@ -171,6 +171,13 @@ def clone(block: Block, name: str) -> Block:
     return replace(block, name=name, clone_of=block.name)
 
 
+class _Values(dict[str, Any]):
+    """Values by block; a name that is none is answered with those that are."""
+
+    def __missing__(self, name: str) -> Any:
+        raise ValueError(f"there is no block '{name}'; the blocks are {', '.join(self)}")
+
+
 @dataclass(frozen=True)
 class ErrorState:
     """Blocks in their order: what is estimated, and the coordinates of its error.
@@ -250,7 +257,9 @@ class ErrorState:
 
     def retract(self, values: Values, error: Any) -> dict[str, Any]:
         """Values that are off by an error (n, 1)."""
-        return {b.name: b.plus(values[b.name], self.part(error, b.name)) for b in self.blocks}
+        return _Values(
+            {b.name: b.plus(values[b.name], self.part(error, b.name)) for b in self.blocks}
+        )
 
     def normalized(self, values: Values) -> dict[str, Any]:
         """Values whose quaternions are of unit length, which they lose by and by to rounding."""
