@@ -182,7 +182,7 @@ class SymbolicComponent(Component):
             )
         if tail in port.fields and self.model.shape(name) != port.fields[tail].shape:
             size = int(np.prod(self.model.shape(name)))
-            if not (size == 1 and port.fields[tail].shape == ()):
+            if not size == port.fields[tail].size == 1:  # a number, whatever axes it has
                 raise ConfigurationError(
                     f"model '{self.model.name}': '{name}' has shape {self.model.shape(name)}, "
                     f"the port declares {port.fields[tail].shape}"

@@ -11,14 +11,14 @@ mapped by the derivative,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
 
 from terrafix.models.core.symmetric import mirrored
-from terrafix.models.filters.error_state import ErrorState, Values
+from terrafix.models.filters.error_state import Block, ErrorState, Values
 from terrafix.models.filters.updates import Measurement, Update
 
 REASONS = (
@@ -43,51 +43,60 @@ class Observation:
     predict : callable
         Of the values of the blocks, and of inputs, parameters and the message's fields, by name:
         what is measured, (m, 1).
-    size : int
-        m.
-    fields : mapping of str to int
-        Sizes of the message's further fields, of which `predict` may make use.
+    elements : mapping of str to str
+        The unit of each of the m elements, by its label.
+    fields : sequence of Block
+        Vectors that the message holds besides, of which `predict` may make use.
     mapped : mapping of str to str
         Further fields that are not exactly known: the field that holds the covariance of each.
-    angles : tuple of int
-        Elements that are angles [rad].
+    angles : sequence of str
+        Labels of elements that are angles, in radians: their differences are within half a turn.
     inputs, parameters : mapping of str to int
         Sizes of what else it reads.
 
     Raises
     ------
     ValueError
-        If a mapped field is none of the message's.
+        If a mapped field is none of the message's, or an angle no element in radians.
     """
 
     predict: Callable[[Values, Values], Any]
-    size: int
-    fields: Mapping[str, int] = field(default_factory=dict)
+    elements: Mapping[str, str]
+    fields: Sequence[Block] = ()
     mapped: Mapping[str, str] = field(default_factory=dict)
-    angles: tuple[int, ...] = ()
+    angles: Sequence[str] = ()
     inputs: Mapping[str, int] = field(default_factory=dict)
     parameters: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        names = [block.name for block in self.fields]
         for name in self.mapped:
-            if name not in self.fields:
+            if name not in names:
                 raise ValueError(
                     f"an observation maps the error of '{name}', which is no field of its message;"
-                    f" the fields are {', '.join(self.fields) or 'none'}"
+                    f" the fields are {', '.join(names) or 'none'}"
                 )
-        wrong = [k for k in self.angles if not 0 <= k < self.size]
-        if wrong:
-            raise ValueError(
-                f"element {wrong[0]} is an angle, but {self.size} elements are measured, from 0 on"
-            )
+        for label in self.angles:
+            if self.elements.get(label) != "rad":
+                listed = ", ".join(f"{k} [{unit}]" for k, unit in self.elements.items())
+                raise ValueError(
+                    f"'{label}' is said to be an angle, and is no element in radians; the "
+                    f"elements are {listed}"
+                )
+
+    @property
+    def size(self) -> int:
+        """M."""
+        return len(self.elements)
 
     def shapes(self) -> dict[str, tuple[int, int]]:
         """Shapes of the message's fields."""
         m = self.size
-        found = {"y": (m, 1)} | {name: (size, 1) for name, size in self.fields.items()}
+        sizes = {block.name: block.size for block in self.fields}
+        found = {"y": (m, 1)} | {name: (size, 1) for name, size in sizes.items()}
         found["R"] = (m, m)
         for name, covariance in self.mapped.items():
-            found[covariance] = (self.fields[name], self.fields[name])
+            found[covariance] = (sizes[name], sizes[name])
         return found | {"present": (m, 1)}
 
     def symbols(self, name: str) -> dict[str, Any]:
@@ -115,8 +124,9 @@ class Observation:
             If what is predicted has another size.
         """
         error = ca.SX.sym("error", state.size)
-        uncertain = {name: ca.SX.sym(name, self.fields[name]) for name in self.mapped}
-        told = {name: message[name] for name in self.fields} | uncertain
+        told = {block.name: message[block.name] for block in self.fields}
+        uncertain = {name: ca.SX.sym(name, *told[name].shape) for name in self.mapped}
+        told |= uncertain
         y = ca.SX(self.predict(state.retract(prior, error), {**given, **told}))
         if y.shape != (self.size, 1):
             raise ValueError(
@@ -144,7 +154,7 @@ class Observation:
             at(ca.jacobian(y, error)),
             noise,
             message["present"],
-            self.angles,
+            tuple(k for k, label in enumerate(self.elements) if label in self.angles),
         )
 
 

@@ -306,8 +306,8 @@ def sar_observation(in_track: str = "speed") -> Observation:
 
     return Observation(
         predict,
-        4,
-        fields={"r_f_e": 3},
+        {"tan_azimuth": "1", "tan_elevation": "1", "slant_range": "m", "in_track_velocity": "m/s"},
+        fields=[vector("r_f_e", unit="m", frame="e")],
         mapped={"r_f_e": "D"},
         inputs={"q_be": 4},
         parameters={"look": 1, "squint": 1},

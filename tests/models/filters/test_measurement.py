@@ -20,7 +20,7 @@ def linear(H, **options):
     def predict(values, _):
         return ca.mtimes(ca.DM(H), ca.vertcat(*values.values()))
 
-    return Observation(predict, len(H), **options)
+    return Observation(predict, {f"y{k}": "rad" for k in range(len(H))}, **options)
 
 
 def kalman(x, P, y, H, R, kept=()):
@@ -99,7 +99,7 @@ def test_absent_elements_are_as_if_they_were_none(rule):
 @RULES
 def test_angles_are_wrapped_at_the_cut(rule):
     """A bearing measured at -pi + 0.05 of one predicted at pi - 0.1 is 0.15 ahead, not 6.13."""
-    state, observation = ErrorState(vector("a", 1)), linear(np.eye(1), angles=(0,))
+    state, observation = ErrorState(vector("a", 1)), linear(np.eye(1), angles=["y0"])
     given = {"x": [np.pi - 0.1], "P": [[0.04]], "y": [-np.pi + 0.05], "R": [[0.01]]}
     x, P, _ = corrected(state, observation, rule, given)
     assert x[0] == pytest.approx(np.pi - 0.1 + 0.8 * 0.15, abs=1e-12)
@@ -153,7 +153,9 @@ def test_the_error_of_what_a_fix_reports_is_mapped(rule):
         line = given["point"] - values["r"]
         return ca.sqrt(ca.dot(line, line))
 
-    observation = Observation(distance, 1, fields={"point": 2}, mapped={"point": "D"})
+    observation = Observation(
+        distance, {"range": "m"}, fields=[vector("point", 2, unit="m")], mapped={"point": "D"}
+    )
     assert list(observation.shapes()) == ["y", "point", "R", "D", "present"]
     D = np.array([[4.0, 1.0], [1.0, 9.0]])
     given = {"x": [0.0, 0.0], "P": 1e-8 * np.eye(2), "y": [5.0], "R": [[0.25]]}
@@ -243,17 +245,20 @@ def test_a_filter_that_does_not_know_how_to_start_is_refused(told, sigmas, said)
     ("make", "said"),
     [
         (
-            lambda: Observation(lambda *_: 0, 1, mapped={"point": "D"}),
+            lambda: Observation(lambda *_: 0, {"a": "m"}, mapped={"point": "D"}),
             "maps the error of 'point', which is no field of its message; the fields are none",
         ),
-        (lambda: linear(np.eye(5)[:2], angles=(2,)), "element 2 is an angle, but 2 elements"),
         (
-            lambda: correct_model("c", TWO, Observation(lambda *_: ca.SX.zeros(2), 1)),
+            lambda: linear(np.eye(5)[:1], angles=["y"]),
+            r"'y' is said .* the elements are y0 \[rad\]",
+        ),
+        (
+            lambda: correct_model("c", TWO, Observation(lambda *_: ca.SX.zeros(2), {"a": "m"})),
             r"predicts an array of shape \(2, 1\); it measures 1 elements",
         ),
         (lambda: correct_model("c", TWO, linear(np.eye(5)), "ukf"), "update must be one of"),
         (
-            lambda: correct_model("c", TWO, Observation(lambda x, _: x["z"], 1)),
+            lambda: correct_model("c", TWO, Observation(lambda x, _: x["z"], {"a": "m"})),
             "there is no block 'z'; the blocks are a, b",
         ),
     ],

@@ -1,0 +1,200 @@
+"""The two components of every filter: its ports follow from what it estimates.
+
+A filter of one's own is two classes, each of a few lines:
+
+    class TrackerPredict(FilterPredict):
+        error_state, process, told = STATE, PROCESS, ("r", "v")
+        accel_psd = Parameter(unit="m^2/s^3")
+
+    class TrackerCorrect(FilterCorrect):
+        error_state, observation = STATE, RANGE
+
+What the process and the observation read are inputs and parameters of the class, declared as those
+of any component; the check before a run compares their shapes. `predict` reads the posterior at
+the start of its step; `correct` reads the prior at the end.
+
+Several corrections in a tick are a chain, in the order that the wiring shows: each reads the
+``estimate`` of the one before it as its prior, and the ``posterior`` of that one as ``earlier``;
+the last one's posterior goes to `predict`. They step at one rate, their fixes come at any.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from terrafix.cosim.declare.parameters import Choice, Parameter
+from terrafix.cosim.declare.ports import BundleInput, BundleOutput, MessageInput, MessageOutput
+from terrafix.cosim.kernels.symbolic import SymbolicComponent
+from terrafix.cosim.memory.fields import Field, Unit
+from terrafix.models.core.model import Model
+from terrafix.models.filters.error_state import Block, ErrorState
+from terrafix.models.filters.measurement import Observation
+from terrafix.models.filters.models import correct_model, predict_model
+from terrafix.models.filters.process import Process
+from terrafix.models.filters.updates import UPDATES
+
+
+def value_field(block: Block) -> Field:
+    """The field of a block's value."""
+    unit = "1" if block.is_rotation else block.unit
+    return Field(
+        (block.value_size,), unit, block.frame, labels=() if block.is_rotation else _axes(block)
+    )
+
+
+def _axes(block: Block) -> tuple[str, ...]:
+    return block.axes if block.size > 1 else ()
+
+
+def estimate_fields(state: ErrorState) -> dict[str, Field]:
+    """Fields of an estimate: every block, and the covariance of the error."""
+    P = Field(
+        (state.size, state.size), "1", doc="covariance of the error, in units of its elements"
+    )
+    return {block.name: value_field(block) for block in state} | {"P": P}
+
+
+def fix_fields(observation: Observation) -> dict[str, Field]:
+    """Fields of the message that an observation takes."""
+    labels = tuple(observation.elements)
+    found = {"y": Field((observation.size,), _units(observation), labels=labels, doc="measured")}
+    found |= {block.name: value_field(block) for block in observation.fields}
+    for name, shape in observation.shapes().items():
+        if name not in (*found, "present"):
+            found[name] = Field(shape, "1", doc="a covariance")
+    doc = "1 where an element was measured, else 0"
+    return found | {"present": Field((observation.size,), "1", labels=labels, doc=doc)}
+
+
+def _units(observation: Observation) -> Unit:
+    units = tuple(observation.elements.values())
+    return units[0] if len(set(units)) == 1 else units
+
+
+def innovation_fields(observation: Observation) -> dict[str, Field]:
+    """Fields of what a correction says about a fix."""
+    each: dict[str, Any] = {"unit": _units(observation), "labels": tuple(observation.elements)}
+    shape = (observation.size,)
+    return {
+        "residual": Field(shape, doc="measured minus predicted", **each),
+        "sigma": Field(shape, doc="predicted, not underweighted", **each),
+        "nis": Field((), "1", doc="normalized innovation squared, not underweighted"),
+        "dof": Field((), "1", doc="number of elements used"),
+        "accepted": Field((), "1", doc="1 if the fix corrected the estimate, else 0"),
+        "reason": Field((), "1", doc="index into terrafix.models.filters.measurement.REASONS"),
+    }
+
+
+def _declare(cls: type, **ports: Any) -> None:
+    """Declare on a class what it does not declare itself."""
+    for name, port in ports.items():
+        if name not in vars(cls):
+            setattr(cls, name, port)
+            port.__set_name__(cls, name)
+
+
+class FilterPredict(SymbolicComponent):
+    """The estimate between fixes, and the covariance of its error: base of a filter's own.
+
+    Attributes
+    ----------
+    error_state : ErrorState
+    process : Process
+    told : tuple of str
+        Blocks that the start message tells; the others start at zero, with a sigma.
+    sigmas : dict of str to str
+        Of the others: the parameter that holds it, ``NAME_sigma0`` unless said otherwise.
+    """
+
+    error_state: ClassVar[ErrorState]
+    process: ClassVar[Process]
+    told: ClassVar[tuple[str, ...]] = ()
+    sigmas: ClassVar[dict[str, str]] = {}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        if "error_state" in vars(cls):
+            state = cls.error_state
+            fields = estimate_fields(state)
+            ports: dict[str, Any] = {
+                "posterior": MessageInput(fields=fields, at="start", doc="corrected estimate"),
+                "prior": BundleOutput(fields, doc="estimate before any fix of this instant"),
+            }
+            if cls.told:
+                told = [block for block in state if block.name in cls.told]
+                size = sum(block.size for block in told)
+                start = {block.name: value_field(block) for block in told}
+                start["P"] = Field((size, size), "1", doc="covariance of their error")
+                ports["start"] = MessageInput(
+                    fields=start, needed_at_start=True, doc="last known state, at t = 0"
+                )
+            _declare(cls, **ports)
+        super().__init_subclass__(**options)
+
+    @property
+    def _sigmas(self) -> dict[str, str]:
+        given = {b.name: f"{b.name}_sigma0" for b in self.error_state if b.name not in self.told}
+        return given | self.sigmas
+
+    def build_model(self) -> Model:
+        """Build the model of the process."""
+        return predict_model(
+            f"{type(self).__name__.lower()}",
+            self.error_state,
+            self.process,
+            told=self.told,
+            sigmas=self._sigmas,
+        )
+
+
+class FilterCorrect(SymbolicComponent):
+    """Correction of the prior by a fix, where it passes the gate: base of a filter's own.
+
+    Attributes
+    ----------
+    error_state : ErrorState
+    observation : Observation
+    """
+
+    error_state: ClassVar[ErrorState]
+    observation: ClassVar[Observation]
+
+    update = Choice(UPDATES, "ekf", doc="how the measurement is weighed")
+    underweighting = Parameter(0.0, minimum=0.0, doc="Lear's factor on H P H'")
+    underweighted_updates = Parameter(0.0, minimum=0.0, doc="how many fixes it applies to")
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        if "error_state" in vars(cls):
+            fields, m = estimate_fields(cls.error_state), cls.observation.size
+            _declare(
+                cls,
+                gate=Parameter(
+                    np.inf,
+                    shape=(m,),
+                    infinite=True,
+                    positive=True,
+                    doc=f"largest NIS accepted with 1 to {m} elements; infinity accepts all",
+                ),
+                prior=BundleInput(fields, doc="estimate before the fix"),
+                earlier=MessageInput(
+                    fields=fields, optional=True, doc="posterior of the correction before this one"
+                ),
+                fix=MessageInput(fields=fix_fields(cls.observation), doc="the fix"),
+                estimate=BundleOutput(fields, doc="the posterior where there is one, or the prior"),
+                posterior=MessageOutput(fields=fields, doc="the estimate, where it was corrected"),
+                innovation=MessageOutput(
+                    fields=innovation_fields(cls.observation), doc="what became of the fix"
+                ),
+            )
+        super().__init_subclass__(**options)
+
+    def build_model(self) -> Model:
+        """Build the model for the chosen update."""
+        return correct_model(
+            f"{type(self).__name__.lower()}_{self.update}",
+            self.error_state,
+            self.observation,
+            self.update,
+            chained=True,
+        )

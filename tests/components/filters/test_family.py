@@ -1,0 +1,219 @@
+"""A filter of one's own: a tracker in two classes, its ports, its consistency, its verdicts."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import terrafix as tf
+from terrafix.components.filters.family import FilterCorrect, FilterPredict
+from terrafix.components.judges.filter_evaluation import FilterEvaluation
+from terrafix.components.noisy import NoisyComponent
+from terrafix.cosim.campaign.campaign import run_campaign
+from terrafix.cosim.lincov.deviations import linear_covariance
+from terrafix.models.core.model import Model
+from terrafix.models.filters.error_state import ErrorState, vector
+from terrafix.models.filters.measurement import Observation
+from terrafix.models.filters.process import Process
+
+STATE = ErrorState(vector("r", 1, unit="m"), vector("v", 1, unit="m/s"))
+PROCESS = Process(
+    rates=lambda x, _, w, __: {"r": x["v"], "v": w["a"]}, noise={"a": ("accel_psd", 1)}
+)
+RANGE = Observation(lambda x, _: x["r"], {"range": "m"})
+SPEED = Observation(lambda x, _: x["v"], {"speed": "m/s"})
+
+
+class Truth(NoisyComponent):
+    """A car pushed about by white acceleration, from a drawn start."""
+
+    default_rate = tf.Rate("0.1")
+    sigma0 = tf.Parameter([10.0, 1.0], shape=(2,), unit=("m", "m/s"))
+    accel_psd = tf.Parameter(0.04, unit="m^2/s^3")
+    r = tf.Output((1,), unit="m")
+    v = tf.Output((1,), unit="m/s")
+
+    def build_model(self):
+        r, v, dt, psd = (ca.SX.sym(n) for n in ("r", "v", "dt", "psd"))
+        sigma0, w = ca.SX.sym("sigma0", 2), ca.SX.sym("w", 2)
+        # exact: the two increments of white acceleration have this covariance's root
+        root = ca.sqrt(psd * dt)
+        dv = root * w[0]
+        dr = root * dt * (w[0] / 2 + w[1] / np.sqrt(12))
+        return Model(
+            "truth",
+            states={"r": r, "v": v},
+            parameters={"sigma0": sigma0, "accel_psd": psd},
+            noise={"w": w},
+            initial={"r": sigma0[0] * w[0], "v": sigma0[1] * w[1]},
+            next={"r": r + dt * v + dr, "v": v + dv},
+            outputs={"r": r, "v": v},
+            step=dt,
+        )
+
+
+class Sensor(NoisyComponent):
+    """Measures a number with white noise."""
+
+    default_rate = tf.Rate("1", offset="1")
+    sigma = tf.Parameter(2.0)
+    x = tf.Input((1,))
+    fix = tf.MessageOutput(
+        fields={"y": tf.Field((1,)), "R": tf.Field((1, 1)), "present": tf.Field((1,))}
+    )
+
+    def build_model(self):
+        x, sigma, w = ca.SX.sym("x"), ca.SX.sym("sigma"), ca.SX.sym("w")
+        return Model(
+            "sensor",
+            inputs={"x": x},
+            parameters={"sigma": sigma},
+            noise={"w": w},
+            outputs={"fix.y": x + sigma * w, "fix.R": sigma**2, "fix.present": 1, "fix.valid": 1},
+        )
+
+
+class RangeSensor(Sensor):
+    x = tf.Input((1,), unit="m")
+    fix = tf.MessageOutput(
+        fields={"y": tf.Field((1,), "m"), "R": tf.Field((1, 1)), "present": tf.Field((1,))}
+    )
+
+
+class SpeedSensor(Sensor):
+    x = tf.Input((1,), unit="m/s")
+    fix = tf.MessageOutput(
+        fields={"y": tf.Field((1,), "m/s"), "R": tf.Field((1, 1)), "present": tf.Field((1,))}
+    )
+
+
+class TrackerPredict(FilterPredict):
+    """Where the car is, and how fast."""
+
+    default_rate = tf.Rate("0.1")
+    error_state, process = STATE, PROCESS
+    accel_psd = tf.Parameter(0.04, unit="m^2/s^3")
+    r_sigma0 = tf.Parameter(10.0, unit="m")
+    v_sigma0 = tf.Parameter(1.0, unit="m/s")
+
+
+class RangeCorrect(FilterCorrect):
+    """Corrects by a range."""
+
+    default_rate = tf.Rate("1", offset="1")
+    error_state, observation = STATE, RANGE
+
+
+class SpeedCorrect(FilterCorrect):
+    """Corrects by a speed."""
+
+    default_rate = tf.Rate("1", offset="1")
+    error_state, observation = STATE, SPEED
+
+
+class TrackerEvaluation(FilterEvaluation):
+    """Errors of the tracker."""
+
+    default_rate = tf.Rate("1")
+    error_state, observation = STATE, RANGE
+
+
+def tracker(*, chain=False, every="1", predict=None, **sensor):
+    with tf.System("tracker", duration="60", seed=3) as system:
+        truth = system.add(Truth(), "truth")
+        ranger = system.add(RangeSensor(**sensor), "ranger")
+        predict = system.add(predict or TrackerPredict(), "predict")
+        correct = system.add(RangeCorrect(), "correct")
+        judge = system.add(TrackerEvaluation(), "judge")
+        system.connect(truth["r"], ranger["x"])
+        system.connect(ranger["fix"], correct["fix"])
+        system.connect(predict["prior"], correct["prior"])
+        last = correct
+        if chain:
+            speeder = system.add(
+                SpeedSensor(sigma=0.5, rate=tf.Rate(every, offset=every)), "speeder"
+            )
+            last = system.add(SpeedCorrect(), "second")
+            system.connect(truth["v"], speeder["x"])
+            system.connect(speeder["fix"], last["fix"])
+            system.connect(correct["estimate"], last["prior"])
+            system.connect(correct["posterior"], last["earlier"])
+        system.connect(last["posterior"], predict["posterior"])
+        system.connect(last["estimate"], judge["estimate"])
+        system.connect(correct["innovation"], judge["innovation"])
+        for name in ("r", "v"):
+            system.connect(truth[name], judge[name])
+    return system
+
+
+def test_ports_follow_from_the_error_state():
+    estimate = TrackerPredict().ports["prior"].fields
+    assert {n: (f.shape, f.unit) for n, f in estimate.items()} == {
+        "r": ((1,), "m"),
+        "v": ((1,), "m/s"),
+        "P": ((2, 2), "1"),
+    }
+    assert RangeCorrect().ports["innovation"].fields["residual"].unit == "m"
+    assert RangeCorrect().settings()["gate"].shape == (1,)
+
+
+def kalman(system_seconds, *, second=None):
+    """Covariance of the tracker's error just after its last fix: by the textbook."""
+    F, q = np.array([[1, 0.1], [0, 1]]), 0.04
+    Q = q * np.array([[1e-3 / 3, 1e-2 / 2], [1e-2 / 2, 0.1]])
+    P = np.diag([100.0, 1.0])
+    for k in range(1, 10 * system_seconds + 1):
+        P = F @ P @ F.T + Q
+        sensors = [([[1.0, 0.0]], 4.0)] if k % 10 == 0 else []
+        if second and k % (10 * second) == 0:
+            sensors.append(([[0.0, 1.0]], 0.25))
+        for H, R in sensors:
+            H = np.array(H)
+            K = P @ H.T / (H @ P @ H.T + R)
+            P = (np.eye(2) - K @ H) @ P
+    return P
+
+
+@pytest.mark.parametrize("second", [None, 1, 3])
+def test_the_covariance_is_the_textbook_s_and_the_errors_are_of_its_size(second):
+    system = tracker(chain=second is not None, every=str(second or 1))
+    result = tf.simulate(system, members=400)
+    P = result.dataset["judge.covariance"].values[-1, 0]
+    np.testing.assert_allclose(P, kalman(60, second=second), rtol=1e-9)
+    low, high = result.evaluation["nees"]["interval_95"]
+    nees = result.dataset["judge.nees"].values[10:]
+    assert 0.9 < nees.mean() / 2 < 1.1
+    assert np.mean((nees.mean(axis=1) > low) & (nees.mean(axis=1) < high)) > 0.8
+    low, high = result.evaluation["nis"]["interval_95"]
+    assert low - 0.02 < result.evaluation["nis"]["mean"] < high + 0.02
+
+
+def test_linear_covariance_takes_it_without_knowing_which():
+    found = linear_covariance(tracker())
+    np.testing.assert_allclose(found.total[-1], kalman(60), rtol=1e-9)
+    np.testing.assert_allclose(found.filter[-1], kalman(60), rtol=1e-9)
+    assert [label.strip() for label in found.labels] == ["r", "v"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        ({}, "consistent"),
+        ({"predict": lambda: TrackerPredict(accel_psd=0.01)}, "overconfident"),
+        ({"predict": lambda: TrackerPredict(accel_psd=0.16)}, "conservative"),
+    ],
+)
+def test_a_campaign_calls_it_by_its_name(settings, word):
+    made = {name: make() for name, make in settings.items()}
+    verdict = run_campaign(tracker(**made), runs=100, workers=1).verdicts["judge"]
+    assert verdict.words[0] == word, verdict.text
+
+
+def test_a_parameter_that_the_process_names_must_be_declared():
+    class Forgetful(FilterPredict):
+        default_rate = tf.Rate("0.1")
+        error_state, process = STATE, PROCESS
+        r_sigma0 = tf.Parameter(10.0, unit="m")
+        v_sigma0 = tf.Parameter(1.0, unit="m/s")
+
+    with pytest.raises(tf.SystemCheckError, match="parameter 'accel_psd' that Forgetful does"):
+        tracker(predict=Forgetful()).check()
