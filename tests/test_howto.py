@@ -18,7 +18,7 @@ def code_of(page: str) -> str:
     return "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
 
 
-@pytest.mark.parametrize("page", ["add_a_sensor", "add_a_filter"])
+@pytest.mark.parametrize("page", ["add_a_sensor", "add_a_filter", "a_filter_of_your_own"])
 def test_the_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(code_of(page), f"{page}.md", "exec"), {"__name__": page})
