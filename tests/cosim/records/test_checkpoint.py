@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import CheckpointError
+from terrafix.cosim.basics.errors import CheckpointError, RateError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import (
     Capabilities,
@@ -162,6 +162,69 @@ def test_resuming_does_not_touch_what_was_recorded(toys, tmp_path, monkeypatch):
     monkeypatch.setattr("terrafix.cosim.records.recorder.FLUSH_SECONDS", -1.0)
     again = simulate(system(toys), out=tmp_path / "run.nc", resume=tmp_path / "run.ckpt")
     assert toys.payload(again.dataset) == whole
+
+
+def test_checkpoints_are_written_at_every_multiple_of_the_interval(toys, tmp_path, monkeypatch):
+    """Of 10 s, every 4 s: at 4 and 8; at the end where it is a multiple, in ticks of the step."""
+    for every, step, expected in ((4, 1, [4, 8]), (5, 1, [5, 10]), ("2.5", "0.5", [5, 10, 15, 20])):
+        ticks = []
+
+        def write(path, content, ticks=ticks):
+            ticks.append(content["master"]["tick"])
+            write_checkpoint(path, content)
+
+        monkeypatch.setattr("terrafix.cosim.engine.run.write_checkpoint", write)
+        made = toys.wire({"c": toys.Clock(rate=Rate(step))}, [], duration=10)
+        simulate(made, checkpoint=tmp_path / "c.ckpt", checkpoint_every=every)
+        assert ticks == expected
+    with pytest.raises(RateError, match="checkpoint interval is 0 s; it must be positive"):
+        simulate(made, checkpoint=tmp_path / "c.ckpt", checkpoint_every=0)
+
+
+def test_a_run_is_resumed_to_the_time_of_its_checkpoint_and_no_earlier(toys, interrupted):
+    """The last checkpoint every 4 s before t = 13 s is that of 12 s."""
+    with pytest.raises(CheckpointError, match="is at t = 12 s, beyond the duration of 11 s"):
+        simulate(system(toys), resume=interrupted, duration=11)
+    result = simulate(system(toys), resume=interrupted, duration=12)
+    whole = simulate(system(toys), duration=12)
+    assert toys.payload(result.dataset) == toys.payload(whole.dataset)
+
+
+@pytest.mark.parametrize("folder", [True, False])
+def test_samples_after_a_state_are_dropped_and_taken_again(toys, tmp_path, folder):
+    """From 6 s back to 3 s and on to 5 s: the times are 0 to 5, in memory and in files."""
+    made = toys.wire({"c": toys.Clock()}, [], ["c.t"])
+    simulation = Simulation(made, folder=tmp_path / "parts" if folder else None)
+    simulation.run_until(2)
+    simulation.recorders[0].flush()
+    simulation.run_until(3)
+    saved = simulation.get_state()
+    assert saved["recorders"]["c_t"]["n_samples"] == 4
+    simulation.run_until(4)
+    simulation.recorders[0].flush()
+    simulation.run_until(6)
+    simulation.set_state(saved)
+    simulation.run_until(5)
+    times, arrays = simulation.recorders[0].history()
+    assert times.tolist() == arrays["c.t"][:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_message_is_recorded_once_also_across_a_checkpoint(toys):
+    """Sent at t = 3; the record of t = 4, after the state was set, has nothing new."""
+    plan = lambda step, members: np.full(len(members), step == 3)  # noqa: E731 - reads as data
+
+    def made():
+        return toys.wire({"s": toys.Sender(plan)}, [], ["s.note"])
+
+    saved = toys.fly(made(), 3).get_state()
+    other = Simulation(made())
+    other.initialize()
+    other.set_state(
+        saved | {"recorders": {"s_note": {**saved["recorders"]["s_note"], "n_samples": 1}}}
+    )
+    other.run_until(5)
+    _, arrays = other.recorders[0].history()
+    assert np.isnan(arrays["s.note.t"]).all()
 
 
 SCRIPT = """

@@ -149,6 +149,11 @@ def test_sample_and_mean_of_all_members_are_drawn_where_they_are_given():
     assert lines(ax, "black") == [[7, 8]]
 
 
+def test_the_mean_is_no_median():
+    ax, _ = drawn_panel([[0.0, 0.0, 3.0], [np.nan, 1.0, 2.0]], [1, 1])
+    assert lines(ax, "black") == [[1, 1.5]]
+
+
 def test_one_member_has_no_sample():
     ax, legend = drawn_panel([[1.0], [2.0]], [1, 1])
     assert list(legend) == ["error", "predicted 3 sigma"]
@@ -191,9 +196,9 @@ def test_peaks_and_dips_of_a_long_history_are_kept():
 @pytest.mark.parametrize(("n", "drawn"), [(POINTS, POINTS), (POINTS + 1, POINTS)])
 def test_a_history_that_is_short_enough_is_drawn_as_it_is(n, drawn):
     ax, _ = drawn_panel(np.zeros((n, 1)), np.arange(n))
-    above, _ = lines(ax, PREDICTED)
-    assert len(above) == drawn
-    assert (above == (3.0 * np.arange(n)).tolist()) == (n == POINTS)
+    above = next(line for line in ax.lines if line.get_color() == PREDICTED)
+    assert len(above.get_ydata()) == drawn
+    assert (above.get_xdata().tolist() == list(range(n))) == (n == POINTS)
 
 
 @pytest.mark.parametrize(
