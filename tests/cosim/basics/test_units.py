@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, WiringError
-from terrafix.cosim.basics.units import conversion_factor
+from terrafix.cosim.basics.units import base_units, conversion_factor
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Flag, Parameter, Text
 from terrafix.cosim.declare.ports import Input, Output
@@ -48,6 +48,33 @@ from terrafix.cosim.system.wiring import check_connection, port_factor
 def test_conversion_factors(source, target, factor):
     found = conversion_factor(source, target)
     assert found == factor if factor is None else found == pytest.approx(factor, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "exponents"),
+    [
+        ("1", 1.0, {}),
+        ("m/s^2", 1.0, {"m": 1, "s": -2}),
+        ("km^2", 1e6, {"m": 2}),
+        ("g", 1e-3, {"kg": 1}),
+        ("N", 1.0, {"kg": 1, "m": 1, "s": -2}),
+        ("N*m", 1.0, {"kg": 1, "m": 2, "s": -2}),
+        ("N/kg", 1.0, {"m": 1, "s": -2}),
+        ("kN/g", 1e6, {"m": 1, "s": -2}),
+        ("deg", math.pi / 180, {"rad": 1}),
+        ("arcsecond", math.pi / 648_000, {"rad": 1}),
+        ("rpm", 2 * math.pi / 60, {"rad": 1, "s": -1}),
+    ],
+)
+def test_base_units_are_those_of_the_si(unit, factor, exponents):
+    """Definitions of the units by hand; radians are kept, as FMI does."""
+    found = base_units(unit)
+    assert found == (pytest.approx(factor, rel=1e-14), exponents)
+
+
+@pytest.mark.parametrize("unit", ["m^0.5", "rad/sqrt(h)", "px"])
+def test_what_has_no_whole_exponent_or_no_base_has_no_base_units(unit):
+    assert base_units(unit) is None
 
 
 def test_what_is_no_unit_or_no_pure_factor_is_refused():

@@ -15,7 +15,7 @@ from terrafix.cosim.basics.errors import ConfigurationError, RateError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.evaluation import Evaluation
 from terrafix.cosim.declare.parameters import Parameter
-from terrafix.cosim.declare.ports import BundleOutput, Output
+from terrafix.cosim.declare.ports import BundleOutput, MessageOutput, Output
 from terrafix.cosim.engine.run import RunError, simulate
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.records.recorder import read_chunks
@@ -173,6 +173,22 @@ def test_members_that_failed_are_nan_from_then_on_also_in_messages(toys):
         True,
     ]
     assert data["s.note.t"].sel(member=6).values[1:].tolist() == [1, 2, 3, 4]
+
+
+def test_where_no_ragged_message_came_its_count_is_zero(toys):
+    """Sent at 1 s and 3 s with as many elements as seconds; recorded at every second."""
+
+    class Ragged(Component):
+        default_rate = Rate("1")
+        note = MessageOutput((4,), ragged=True)
+
+        def _step_impl(self, t, dt):
+            if t % 2:
+                self.note.publish(t, 1.0, count=int(t))
+
+    data = simulate(toys.wire({"r": Ragged()}, [], ["r.note"], duration=4)).dataset
+    assert data["r.note.count"].values[:, 0].tolist() == [0, 1, 0, 3, 0]
+    assert np.isnan(data["r.note.t"].values[[0, 2, 4]]).all()
 
 
 def test_an_axis_of_many_labels_is_named_after_the_first_and_the_last(toys):
