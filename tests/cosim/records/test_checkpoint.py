@@ -23,6 +23,7 @@ from terrafix.cosim.declare.ports import (
 from terrafix.cosim.engine.run import RunError, simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
+from terrafix.cosim.records.recorder import read_chunks
 from terrafix.cosim.records.results import read_result
 from terrafix.cosim.system.dispersion import Dispersion
 
@@ -207,6 +208,20 @@ def test_samples_after_a_state_are_dropped_and_taken_again(toys, tmp_path, folde
     simulation.run_until(5)
     times, arrays = simulation.recorders[0].history()
     assert times.tolist() == arrays["c.t"][:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_files_of_samples_are_cut_within_one(toys, tmp_path):
+    """Files of 3 and 4 samples, put back to 5: what is left of the second is 2, then 1 new."""
+    made = toys.wire({"c": toys.Clock()}, [], ["c.t"])
+    simulation = toys.fly(made, 2, folder=tmp_path / "parts")
+    (recorder,) = simulation.recorders
+    recorder.flush()
+    simulation.run_until(6)
+    recorder.flush()
+    recorder.set_state(recorder.get_state() | {"n_samples": 5})
+    recorder.sample(9.0)
+    assert recorder.history()[0].tolist() == [0, 1, 2, 3, 4, 9]
+    assert [len(t) for t, _ in read_chunks(tmp_path / "parts", "c_t")] == [3, 2, 1]
 
 
 def test_a_message_is_recorded_once_also_across_a_checkpoint(toys):
