@@ -114,6 +114,16 @@ def test_a_failed_run_does_not_replace_an_earlier_result(tmp_path, toys):
     assert out.read_bytes() == before
 
 
+def test_a_failed_run_takes_the_name_of_the_result_where_there_was_none(tmp_path, toys):
+    """What it recorded until t = 2 s; the next failure does not replace that."""
+    for out in ("run.nc", "run.failed.nc"):
+        broken = toys.wire({"f": toys.Failing("raise")}, [], ["f.y"], duration="5")
+        with pytest.raises(RunError) as caught:
+            simulate(broken, out=tmp_path / "run.nc")
+        assert caught.value.result.out == tmp_path / out
+        assert read_result(tmp_path / out)["time"].values.tolist() == [0, 1, 2]
+
+
 def test_a_result_that_cannot_be_written_keeps_its_records(tmp_path, toys, monkeypatch):
     def full(*_, **__):
         raise RuntimeError("NetCDF: HDF error")

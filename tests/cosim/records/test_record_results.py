@@ -19,7 +19,7 @@ from terrafix.cosim.declare.ports import BundleOutput, MessageOutput, Output
 from terrafix.cosim.engine.run import RunError, simulate
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.records.recorder import read_chunks
-from terrafix.cosim.records.results import read_result, salvage
+from terrafix.cosim.records.results import build_dataset, read_result, salvage
 
 
 class Rich(Component):
@@ -173,6 +173,15 @@ def test_members_that_failed_are_nan_from_then_on_also_in_messages(toys):
         True,
     ]
     assert data["s.note.t"].sel(member=6).values[1:].tolist() == [1, 2, 3, 4]
+
+
+def test_attributes_are_texts_numbers_or_json():
+    given = {"text": "a", "n": 3, "list": [1, np.int64(2)], "array": np.eye(2), "path": [Path("a")]}
+    stored = build_dataset({}, np.arange(2), given).attrs
+    assert (stored["text"], stored["n"]) == ("a", 3)
+    assert stored["list"] == "[1, 2]"
+    assert stored["array"] == "[[1.0, 0.0], [0.0, 1.0]]"
+    assert stored["path"] == '["a"]'
 
 
 def test_where_no_ragged_message_came_its_count_is_zero(toys):
