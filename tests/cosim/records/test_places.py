@@ -4,6 +4,7 @@ import runpy
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Output
 from terrafix.cosim.engine.run import RunError, simulate
+from terrafix.cosim.records.places import Places
 from terrafix.cosim.records.results import read_result
 from terrafix.cosim.system.system import System
 
@@ -96,6 +98,33 @@ def test_what_a_killed_run_left_is_kept_and_said(tmp_path, toys):
     kept = tmp_path / "run.nc.interrupted.nc"
     assert result.notes == [f"what an interrupted run had recorded is kept in '{kept}'"]
     assert len(read_result(kept)["time"]) >= 51
+
+
+@pytest.mark.parametrize(
+    ("options", "checkpoint", "folder", "told"),
+    [
+        ({"out": "a/run.nc"}, "a/run.ckpt", "a/run.nc.parts", ["run.nc", "run.nc.parts"]),
+        (
+            {"out": "a/run.nc", "checkpoint": "b/c.ckpt"},
+            "b/c.ckpt",
+            "a/run.nc.parts",
+            ["../a/run.nc", "../a/run.nc.parts"],
+        ),
+        ({"checkpoint": "b/c.ckpt"}, "b/c.ckpt", "b/c.ckpt.parts", [None, "c.ckpt.parts"]),
+        ({}, "name.ckpt", "name.ckpt.parts", [None, "name.ckpt.parts"]),
+        ({"checkpointing": False}, "name.ckpt", None, [None, None]),
+    ],
+)
+def test_places_are_named_after_the_result_or_the_checkpoint(options, checkpoint, folder, told):
+    """What a checkpoint tells of them is seen from its own folder: all can move together."""
+    given = {"out": None, "checkpoint": None} | {
+        k: v if isinstance(v, bool) else Path(v) for k, v in options.items()
+    }
+    places = Places.of_run("name", **{"checkpointing": True} | given)
+    assert places.checkpoint == Path(checkpoint)
+    assert places.folder == (folder and Path(folder))
+    assert places.described() == dict(zip(("out", "folder"), told, strict=True))
+    assert places.notes == (["checkpoints go to 'name.ckpt'"] if options == {} else [])
 
 
 def test_a_failed_run_does_not_replace_an_earlier_result(tmp_path, toys):
