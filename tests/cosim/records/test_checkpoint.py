@@ -379,6 +379,7 @@ def test_what_is_saved_is_read_back_with_its_types(tmp_path):
         "a": np.arange(6, dtype=np.int32).reshape(2, 3),
         "empty": np.zeros((0, 4)),
         "none": None,
+        "scalars": [np.int64(2**60 + 1), np.bool_(True)],  # more digits than a float has
         "nested": {"list": [1, 2.5, "x", True, np.float64(3)], "mask": np.array([True, False])},
         "nan": float("nan"),
         "big": 2**70,
@@ -390,6 +391,8 @@ def test_what_is_saved_is_read_back_with_its_types(tmp_path):
     assert found["empty"].shape == (0, 4)
     assert found["nested"]["list"] == [1, 2.5, "x", True, 3.0]
     assert found["nested"]["mask"].tolist() == [True, False]
+    assert found["scalars"] == [2**60 + 1, True]
+    assert found["scalars"][1] is True
     assert found["nan"] != found["nan"]
     assert (found["none"], found["big"]) == (None, 2**70)
 

@@ -127,6 +127,16 @@ def test_places_are_named_after_the_result_or_the_checkpoint(options, checkpoint
     assert places.notes == (["checkpoints go to 'name.ckpt'"] if options == {} else [])
 
 
+def test_a_file_where_the_records_would_be_kept_is_refused(tmp_path, toys):
+    (tmp_path / "run.nc.parts").write_text("somebody's")
+    system = toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3")
+    with pytest.raises(
+        ConfigurationError, match="but a file of that name is there\n  move it away"
+    ):
+        simulate(system, out=tmp_path / "run.nc")
+    assert (tmp_path / "run.nc.parts").read_text() == "somebody's"
+
+
 def test_a_failed_run_does_not_replace_an_earlier_result(tmp_path, toys):
     out = tmp_path / "run.nc"
     simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
