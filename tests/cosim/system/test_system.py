@@ -245,6 +245,14 @@ def test_an_unconnected_input_names_what_would_fit(toys):
         check(system)
 
 
+def test_optional_inputs_and_those_with_a_default_need_no_connection(toys):
+    class Easy(toys.EndSpy):
+        u = Input(unit="s", default=1.0)
+        v = Input(optional=True)
+
+    assert check(toys.wire({"s": Easy()}, [])).order == ["s"]
+
+
 def test_an_empty_system_is_a_mistake():
     with pytest.raises(SystemCheckError, match="the system has no components"):
         check(System("nothing"))
