@@ -12,7 +12,7 @@ from terrafix.cosim.basics.errors import ConfigurationError, WiringError
 from terrafix.cosim.basics.units import base_units, conversion_factor
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Flag, Parameter, Text
-from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.declare.ports import Input, MessageInput, MessageOutput, Output
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.system.wiring import check_connection, port_factor
 
@@ -136,6 +136,12 @@ def test_factors_by_port():
             Input(unit="km", dtype=np.int64),
             "only float64 ports are converted",
         ),
+        (
+            MessageOutput((4,), ragged=True),
+            MessageInput((4,)),
+            "one side is ragged, the other is not",
+        ),
+        (Output(), MessageInput(), "a signal cannot feed a message: a message has a time"),
         (Input(), Input(), "a.y'? is an input; a connection goes from an output"),
         (Output(), Output(), "b.u'? is an output; a connection ends at an input"),
         (

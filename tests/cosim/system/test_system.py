@@ -245,6 +245,15 @@ def test_an_unconnected_input_names_what_would_fit(toys):
         check(system)
 
 
+def test_a_connection_hands_nothing_on_from_the_future(toys):
+    system = toys.wire({"c": toys.Clock(), "s": toys.EndSpy()}, [])
+    for delay in (-1, "-1/1000"):
+        with pytest.raises(RateError, match=r"delay of 'c\.t -> s\.u' is negative"):
+            system.connect("c.t", "s.u", delay=delay)
+    system.connect("c.t", "s.u", delay="1/1000")
+    assert system.connections[0].delay == Fraction(1, 1000)
+
+
 def test_optional_inputs_and_those_with_a_default_need_no_connection(toys):
     class Easy(toys.EndSpy):
         u = Input(unit="s", default=1.0)
