@@ -115,6 +115,48 @@ def test_a_member_that_fails_later_does_so_once_and_the_next_in_its_turn(toys):
     assert [(e["member"], e["t_s"]) for e in simulation.master.excluded] == [(7, 2.0), (4, 3.0)]
 
 
+@kinds
+def test_a_member_that_failed_flies_again_from_an_earlier_state(toys, kind, monkeypatch):
+    """Back at t = 1 s, with a square of 9, it has a root again: its failure left no mark."""
+    monkeypatch.setenv("TERRAFIX_KERNEL", kind)
+    root = Root()
+    simulation = Simulation(toys.wire({"z": root}, []), members=2)
+    simulation.run_until(1)
+    saved = simulation.get_state()
+    root.parameter_values["square"][1] = -1.0
+    simulation.run_until(3)
+    assert simulation.master.active.tolist() == [True, False]
+    simulation.set_state(saved)
+    root.parameter_values["square"][1] = 9.0
+    simulation.run_until(3)
+    assert simulation.master.active.tolist() == [True, True]
+    assert root.y.tolist() == [[1, 2], [1, 3]]
+
+
+class Waiting(SymbolicComponent):
+    """Cannot begin without a message."""
+
+    default_rate = Rate("1")
+    note = MessageInput((2,), unit="m", needed_at_start=True)
+    y = Output()
+
+    def build_model(self):
+        """Build the model."""
+        note = ca.SX.sym("note", 2)
+        return Model("waiting", inputs={"note": note}, outputs={"y": note[1]})
+
+
+def test_a_member_without_the_message_that_is_needed_at_start_is_excluded(toys):
+    """Of members 3 and 8 the message of t = 0 reaches the even one."""
+    plan = lambda step, members: members % 2 == 0  # noqa: E731 - reads as data
+    parts = {"a": toys.Sender(plan, at_start=True), "w": Waiting()}
+    simulation = toys.fly(toys.wire(parts, ["a.note -> w.note"]), 2, members=[3, 8])
+    (failure,) = simulation.master.excluded
+    assert (failure["member"], failure["t_s"]) == (3, 0.0)
+    assert failure["reason"] == "no 'note' was received at t = 0"
+    assert parts["w"].y[1] == 8
+
+
 class Teller(SymbolicComponent):
     """Sends what it reads if that is above 1.5."""
 
