@@ -292,8 +292,8 @@ def test_the_first_failure_to_terminate_is_named_and_all_are_given_back(toys):
     assert [c.lent for c in system.nodes.values()] == [None] * 3
 
 
-def test_latches_close_before_recorders_look(toys):
-    """A recorder sees the end of the tick; a start-read of the next step sees the same value."""
+def test_a_start_read_is_recorded_a_step_later_than_its_source(toys):
+    """At tick k it publishes what the source published at k - 1; of t = 0, its own start."""
     spy = toys.StartSpy()
     system = toys.wire(
         {"m": toys.Clock(), "s": spy},
