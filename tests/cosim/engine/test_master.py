@@ -193,6 +193,19 @@ def test_every_due_component_steps_once_per_activation(toys):
     assert simulation.master.component_steps == sum(map(len, times.values())) + 6
 
 
+@pytest.mark.parametrize("others", [(3,), (3, 5), (3, 5, 7), (7, 5, 3), (4, 6, 3)])
+@pytest.mark.parametrize("first", ["a", "z"])  # stands before and after the others
+def test_all_that_is_due_at_a_tick_steps_in_one_order(toys, others, first):
+    """x (1 s) -> y (2 s) -> w (1 s): at t, w sees the last even second, whoever else is due."""
+    last = toys.EndSpy()
+    parts = {f"m{k}": toys.Clock(rate=Rate(period)) for k, period in enumerate(others)}
+    names = [f"{first}{n}" for n in "xyw"]
+    parts |= dict(zip(names, (toys.Clock(), toys.EndSpy(rate=Rate(2)), last), strict=True))
+    x, y, w = names
+    toys.fly(toys.wire(parts, [f"{x}.t -> {y}.u", f"{y}.echo -> {w}.u"]), 60)
+    assert last.values() == [(t, t - t % 2) for t in range(1, 61)]
+
+
 def test_a_run_in_pieces_is_the_run_in_one(toys):
     whole = toys.fly(noisy(toys), 12, members=3)
     pieces = Simulation(noisy(toys), members=3)
