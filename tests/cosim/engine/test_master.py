@@ -267,6 +267,10 @@ def test_a_system_says_seed_and_members_unless_told_otherwise(toys):
     assert (Simulation(system).seed, len(Simulation(system).members)) == (3, 2)
     assert Simulation(system, seed=0).seed == 0
     assert Simulation(system, members=[4]).members.tolist() == [4]
+    with pytest.raises(ConfigurationError, match="members is 0; an ensemble has at least 1"):
+        Simulation(system, members=0)
+    with pytest.raises(ConfigurationError, match=r"members \[\] must be different whole numbers"):
+        Simulation(system, members=[])
 
 
 def test_the_nominal_run_draws_no_noise_and_no_dispersion(toys):
