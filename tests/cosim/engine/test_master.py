@@ -273,6 +273,12 @@ def test_a_system_says_seed_and_members_unless_told_otherwise(toys):
         Simulation(system, members=[])
 
 
+def test_records_can_be_left_out(toys):
+    system = toys.wire({"c": toys.Clock()}, [], ["c.t"])
+    assert [r.name for r in Simulation(system).recorders] == ["c_t"]
+    assert Simulation(system, recording=False).recorders == []
+
+
 def test_the_nominal_run_draws_no_noise_and_no_dispersion(toys):
     walk = toys.Walk(start=[3.0, 4.0])
     system = toys.wire({"w": walk}, [])
