@@ -193,6 +193,19 @@ def test_every_due_component_steps_once_per_activation(toys):
     assert simulation.master.component_steps == sum(map(len, times.values())) + 6
 
 
+@pytest.mark.parametrize("others", [(3,), (3, 5), (3, 5, 7), (7, 5, 3), (4, 6, 3)])
+@pytest.mark.parametrize("first", ["a", "z"])  # stands before and after the others
+def test_all_that_is_due_at_a_tick_steps_in_one_order(toys, others, first):
+    """x (1 s) -> y (2 s) -> w (1 s): at t, w sees the last even second, whoever else is due."""
+    last = toys.EndSpy()
+    parts = {f"m{k}": toys.Clock(rate=Rate(period)) for k, period in enumerate(others)}
+    names = [f"{first}{n}" for n in "xyw"]
+    parts |= dict(zip(names, (toys.Clock(), toys.EndSpy(rate=Rate(2)), last), strict=True))
+    x, y, w = names
+    toys.fly(toys.wire(parts, [f"{x}.t -> {y}.u", f"{y}.echo -> {w}.u"]), 60)
+    assert last.values() == [(t, t - t % 2) for t in range(1, 61)]
+
+
 def test_a_run_in_pieces_is_the_run_in_one(toys):
     whole = toys.fly(noisy(toys), 12, members=3)
     pieces = Simulation(noisy(toys), members=3)
@@ -254,6 +267,16 @@ def test_a_system_says_seed_and_members_unless_told_otherwise(toys):
     assert (Simulation(system).seed, len(Simulation(system).members)) == (3, 2)
     assert Simulation(system, seed=0).seed == 0
     assert Simulation(system, members=[4]).members.tolist() == [4]
+    with pytest.raises(ConfigurationError, match="members is 0; an ensemble has at least 1"):
+        Simulation(system, members=0)
+    with pytest.raises(ConfigurationError, match=r"members \[\] must be different whole numbers"):
+        Simulation(system, members=[])
+
+
+def test_records_can_be_left_out(toys):
+    system = toys.wire({"c": toys.Clock()}, [], ["c.t"])
+    assert [r.name for r in Simulation(system).recorders] == ["c_t"]
+    assert Simulation(system, recording=False).recorders == []
 
 
 def test_the_nominal_run_draws_no_noise_and_no_dispersion(toys):
@@ -292,8 +315,8 @@ def test_the_first_failure_to_terminate_is_named_and_all_are_given_back(toys):
     assert [c.lent for c in system.nodes.values()] == [None] * 3
 
 
-def test_latches_close_before_recorders_look(toys):
-    """A recorder sees the end of the tick; a start-read of the next step sees the same value."""
+def test_a_start_read_is_recorded_a_step_later_than_its_source(toys):
+    """At tick k it publishes what the source published at k - 1; of t = 0, its own start."""
     spy = toys.StartSpy()
     system = toys.wire(
         {"m": toys.Clock(), "s": spy},

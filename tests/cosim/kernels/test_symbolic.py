@@ -73,6 +73,68 @@ def test_a_component_flown_again_is_flown_as_it_is_asked_to(toys, kind, monkeypa
     assert found[0] == found[2] != [[0, 0]]
 
 
+class Elapsed(SymbolicComponent):
+    """Adds up the lengths of its steps."""
+
+    x = Output(unit="s")
+
+    def build_model(self):
+        """Build the model."""
+        x, dt = ca.SX.sym("x"), ca.SX.sym("dt")
+        return Model("elapsed", states={"x": x}, next={"x": x + dt}, outputs={"x": x}, step=dt)
+
+
+@kinds
+@pytest.mark.parametrize(
+    ("rate", "end", "last"),
+    [
+        (Rate("0.25", offset="1.5"), "5.1", 5.0),  # 1.5 s, then 14 steps of 0.25 s
+        (Rate("0.25", offset="0.125"), 3, 2.875),  # 0.125 s, then 11
+        (Rate("0.25"), "2.3", 2.25),
+        (Rate(times=["0.5", "0.75", "4"]), 5, 4.0),
+    ],
+)
+def test_steps_add_up_to_the_last_activation(toys, kind, rate, end, last, monkeypatch):
+    """All in binary fractions, so that the sum is exact."""
+    monkeypatch.setenv("TERRAFIX_KERNEL", kind)
+    elapsed = Elapsed(rate=rate)
+    toys.fly(toys.wire({"e": elapsed, "base": toys.Clock(rate=Rate("0.125"))}, []), end)
+    assert elapsed.x.tolist() == [last]
+    alone = Elapsed(rate=rate)
+    toys.fly(toys.wire({"e": alone}, []), end)
+    assert alone.x.tolist() == [last]
+
+
+class Total(SymbolicComponent):
+    """Adds up what it reads."""
+
+    default_rate = Rate("0.25")
+    u = Input(unit="s")
+    x = Output(unit="s")
+
+    def build_model(self):
+        """Build the model."""
+        x, u = ca.SX.sym("x"), ca.SX.sym("u")
+        return Model("total", inputs={"u": u}, states={"x": x}, next={"x": x + u}, outputs={"x": x})
+
+
+class TotalBefore(Total):
+    """Adds up what it read a step before."""
+
+    u = Input(unit="s", at="start")
+
+
+@kinds
+@pytest.mark.parametrize("name", ["a", "z"])  # before and after the source by name
+def test_a_slow_source_is_read_at_its_own_tick_or_a_step_later(toys, kind, name, monkeypatch):
+    """Four reads a second of 0, 1, 2, 3 s: 4 (0 + 1 + 2 + 3) of t - 1/4, and 4 more with t = 4."""
+    monkeypatch.setenv("TERRAFIX_KERNEL", kind)
+    for total, expected in ((Total(), 28.0), (TotalBefore(), 24.0)):
+        system = toys.wire({"m": toys.Clock(), name: total}, [f"m.t -> {name}.u"])
+        toys.fly(system, 4)
+        assert total.x.tolist() == [expected]
+
+
 class Root(SymbolicComponent):
     """The root of a parameter, beside a number that is always finite."""
 

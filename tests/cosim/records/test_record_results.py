@@ -383,7 +383,7 @@ def test_durations_that_cannot_be_are_refused(toys):
     system = toys.wire({"c": toys.Clock()}, [])
     with pytest.raises(RateError, match="system 'test' has no duration; give one"):
         simulate(system)
-    with pytest.raises(RateError, match="duration is 0"):
+    with pytest.raises(RateError, match="duration is 0 s; it must be positive"):
         simulate(system, duration=0)
     with pytest.raises(RateError, match=r"duration is 0\.5 s, shorter than the base step of 1 s"):
         simulate(system, duration="0.5")

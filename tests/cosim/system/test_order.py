@@ -125,6 +125,8 @@ def held(t, dt, period, offset=0):
         ((2, 0), (2, 1)),
         ((6, 4), (2, 2)),
         ((3, 2), (4, 3)),
+        ((2, 0), (2, 4)),  # steps on the reader's grid, before the reader's first step
+        ((1, 0), (1, 3)),
     ],
 )
 def test_start_reads_of_any_source_see_the_beginning_of_the_step(toys, source, reader, name):
