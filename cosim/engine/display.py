@@ -150,10 +150,17 @@ def _fixes_line(fixes: Sequence[Mapping[str, Any]]) -> str:
     text = f"fixes {len(fixes)}"
     if accepted:
         text += f", accepted {sum(accepted) / len(accepted):.1%}"
-    reasons = Counter(str(f["reason"]) for f in fixes if f.get("reason"))
+    reasons = Counter(reason for f in fixes for reason in _reasons(f.get("reason")))
     if reasons:
         text += "; " + ", ".join(f"{reason}: {n}" for reason, n in reasons.most_common())
     return text
+
+
+def _reasons(told: str | Mapping[str, int] | None) -> list[str]:
+    """Why a fix ended as it did: in one word where all members agree, else members by reason."""
+    if not told:
+        return []
+    return [told] if isinstance(told, str) else list(told)
 
 
 # ---------------------------------------------------------------------- what went wrong

@@ -148,7 +148,7 @@ class WindowView:
             self._values,
             shape=(self._values.shape[0], 2 * len(self._times), *self._values.shape[2:]),
         )
-        values[:, : self.n_samples] = self._values
+        values[:, : self.n_samples] = self.samples
         self._values = values
         self._times = np.concatenate([self._times, np.empty_like(self._times)])
 

@@ -1,5 +1,6 @@
 """Rational time: periods, base steps, activations, and the texts of refusals."""
 
+import math
 from decimal import Decimal
 from fractions import Fraction
 from itertools import islice
@@ -8,7 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafix.cosim.basics.clock import Rate, base_step, rational_gcd, seconds, text_seconds
+from terrafix.cosim.basics.clock import (
+    Rate,
+    base_step,
+    hertz,
+    rational_gcd,
+    seconds,
+    text_seconds,
+)
 from terrafix.cosim.basics.errors import RateError, SystemCheckError
 from terrafix.cosim.system.check import check
 
@@ -18,6 +26,14 @@ def test_base_step_is_the_rational_gcd():
     assert rational_gcd([Fraction("1/30"), Fraction("8.21")]) == Fraction(1, 300)
     assert base_step([Fraction("0.01"), Fraction("8.2")]) == Fraction(1, 100)
     assert base_step(Rate(hz="1256.98").exact_numbers) == Fraction(50, 62849)
+    assert Rate(1, offset="0.3").exact_numbers == (1, Fraction(3, 10))
+    assert base_step(Rate(1, offset="0.3").exact_numbers) == Fraction(1, 10)
+
+
+def test_without_a_period_listed_times_choose_the_base_step_and_without_any_it_is_a_second():
+    assert base_step([], [Fraction(1, 2), Fraction(3, 4)]) == Fraction(1, 4)
+    assert base_step([Fraction(1)], [Fraction(3, 4)]) == 1
+    assert base_step([]) == 1
 
 
 @given(st.lists(st.fractions(min_value="1/997", max_value=1000, max_denominator=997), min_size=1))
@@ -50,6 +66,10 @@ def test_written_seconds_read_back_exactly_beyond_a_decimals_digits(value):
         (3, Fraction(3)),
         (Decimal("0.1"), Fraction(1, 10)),
         ("1e-3 s", Fraction(1, 1000)),
+        ("2 h", Fraction(7200)),
+        ("5 us", Fraction(1, 200_000)),
+        ("1 MIN", Fraction(60)),
+        ("1e18", Fraction(10**18)),
     ],
 )
 def test_times_are_read_exactly(text, exact):
@@ -57,11 +77,17 @@ def test_times_are_read_exactly(text, exact):
 
 
 @pytest.mark.parametrize(
-    ("text", "period"),
-    [("50", "0.02"), ("4 kHz", "1/4000"), ("2 MHz", "1/2000000"), ("3 Hz", "1/3")],
+    ("text", "exact"),
+    [("50", 50), ("8 Hz", 8), ("2 kHz", 2000), ("1.5 MHz", 1_500_000), ("3 mhz", 3_000_000)],
 )
-def test_rates_are_read_exactly(text, period):
-    assert Rate(hz=text) == Rate(period)
+def test_rates_are_read_exactly(text, exact):
+    assert hertz(text) == exact
+    assert Rate(hz=text).period == Fraction(1, exact)
+
+
+def test_millihertz_are_not_taken_for_megahertz():
+    with pytest.raises(RateError, match="rate is '1 mHz', which is not a rate in hertz"):
+        hertz("1 mHz")
 
 
 @pytest.mark.parametrize(
@@ -75,6 +101,7 @@ def test_rates_are_read_exactly(text, period):
         ("1/0", "division by zero"),
         (0, "it must be positive"),
         ("-1", "it must be positive"),
+        ("1e19", "which no simulation can count"),
         (True, "give a time in seconds"),
         ([1], "give a time in seconds as a string"),
     ],
@@ -87,11 +114,15 @@ def test_what_is_no_period_is_refused_with_a_hint(value, text):
 def test_schedules_that_contradict_themselves_are_refused():
     with pytest.raises(RateError, match="exactly one of a period, hz or times"):
         Rate("1", hz=1)
-    with pytest.raises(RateError, match="times must be increasing"):
-        Rate(times=["1", "1"])
-    for times in (["2", "1"], ["1", "3", "2"], ["-1", "1"]):
+    for listed in (["1", "1"], ["2", "1"], ["0", "3", "2"], ["-1", "1"]):
         with pytest.raises(RateError, match="times must be increasing and not negative"):
-            Rate(times=times)
+            Rate(times=listed)
+    with pytest.raises(RateError, match="times is empty"):
+        Rate(times=[])
+    with pytest.raises(RateError, match="rate is 0; it must be positive"):
+        Rate(hz=0)
+    with pytest.raises(RateError, match=r"offset is -0\.5 s; it must not be negative"):
+        Rate(1, offset="-0.5")
     with pytest.raises(RateError, match="an offset goes with a period"):
         Rate(times=["1"], offset="1")
     with pytest.raises(RateError, match="times is the text"):
@@ -138,6 +169,15 @@ def test_listed_times_are_snapped_to_the_next_tick():
     for tick, line in zip(ticks, lines[::2], strict=True):
         assert 0 <= tick * base - line < base
     assert ticks == sorted(set(ticks))
+
+
+def test_a_listed_time_goes_to_the_point_after_it_never_to_the_nearest():
+    """By hand, on a grid of 0.5 s of five ticks: 0.1 -> 0.5, 0.5 -> 0.5, 1.01 -> 1.5, 2 -> 2."""
+    rate = Rate(times=["0.1", "1.01", "2"])
+    assert list(rate.ticks(Fraction(1, 10), Fraction(1, 2))) == [5, 15, 20]
+    assert list(rate.ticks(Fraction(1, 10), Fraction(1, 2), after=5)) == [15, 20]
+    assert [rate.last_tick(Fraction(1, 10), Fraction(1, 2), k) for k in (4, 5, 19)] == [0, 5, 15]
+    assert list(Rate(times=["0.5"]).ticks(Fraction(1, 10), Fraction(1, 2))) == [5]
 
 
 def test_listed_times_closer_than_the_base_step_are_refused(toys):
@@ -204,6 +244,26 @@ def test_a_recorder_does_not_move_what_is_snapped(toys):
 def test_a_rate_can_be_pasted_back(rate, text):
     assert repr(rate) == text
     assert eval(text) == rate
+
+
+@pytest.mark.parametrize(
+    ("rate", "text", "identity", "at_zero", "last"),
+    [
+        (Rate("0.5"), "every 0.5 s", "every 0.5 s", True, math.inf),
+        (Rate(2, offset="1/3"), "every 2 s from 1/3 s", "every 2 s from 1/3 s", False, math.inf),
+        (Rate(times=[0, 1, 2, 3]), "at 0, 1, 2, 3 s", "at 0, 1, 2, 3 s", True, 3.0),
+        (
+            Rate(times=[1, 2, 3, 4, "4.5"]),
+            "at 1, 2, 3, 4, ... s",
+            "at 1, 2, 3, 4, 4.5 s",
+            False,
+            4.5,
+        ),
+    ],
+)
+def test_a_rate_says_when_it_begins_and_ends(rate, text, identity, at_zero, last):
+    assert (str(rate), rate.identity()) == (text, identity)
+    assert (rate.starts_at_zero, rate.last) == (at_zero, last)
 
 
 def test_a_long_list_of_times_is_cut_and_counted():

@@ -105,6 +105,19 @@ def test_memory_of_a_container_of_version_1_that_sees_the_paths_outside(system):
     assert machine.available_memory() == 2 * MIB
 
 
+def test_a_container_that_uses_more_than_its_limit_has_nothing_left(system):
+    system(
+        {
+            "proc/self/cgroup": "0::/a\n",
+            "groups/a/memory.max": f"{64 * MIB}\n",
+            "groups/a/memory.current": f"{70 * MIB}\n",
+        }
+    )
+    assert machine.available_memory() == 0
+    with pytest.raises(ConfigurationError, match=r"3\.0 GiB for a map, and 0\.0 GiB are"):
+        machine.require_memory("terrain", 3 * 1024 * MIB, "a map", "use a smaller one")
+
+
 def test_a_processor_is_named(system):
     system({"proc/cpuinfo": "model name\t: Fast 1\nflags\t: a b\n\nmodel name\t: Fast 1\n"})
     assert machine.cpu_name() == "Fast 1"

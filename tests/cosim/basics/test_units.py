@@ -12,7 +12,7 @@ from terrafix.cosim.basics.errors import ConfigurationError, WiringError
 from terrafix.cosim.basics.units import base_units, conversion_factor
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Flag, Parameter, Text
-from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.declare.ports import Input, MessageInput, MessageOutput, Output
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.system.wiring import check_connection, port_factor
 
@@ -50,6 +50,33 @@ def test_conversion_factors(source, target, factor):
     assert found == factor if factor is None else found == pytest.approx(factor, rel=1e-15)
 
 
+@pytest.mark.parametrize(
+    ("unit", "factor", "exponents"),
+    [
+        ("1", 1.0, {}),
+        ("m/s^2", 1.0, {"m": 1, "s": -2}),
+        ("km^2", 1e6, {"m": 2}),
+        ("g", 1e-3, {"kg": 1}),
+        ("N", 1.0, {"kg": 1, "m": 1, "s": -2}),
+        ("N*m", 1.0, {"kg": 1, "m": 2, "s": -2}),
+        ("N/kg", 1.0, {"m": 1, "s": -2}),
+        ("kN/g", 1e6, {"m": 1, "s": -2}),
+        ("deg", math.pi / 180, {"rad": 1}),
+        ("arcsecond", math.pi / 648_000, {"rad": 1}),
+        ("rpm", 2 * math.pi / 60, {"rad": 1, "s": -1}),
+    ],
+)
+def test_base_units_are_those_of_the_si(unit, factor, exponents):
+    """Definitions of the units by hand; radians are kept, as FMI does."""
+    found = base_units(unit)
+    assert found == (pytest.approx(factor, rel=1e-14), exponents)
+
+
+@pytest.mark.parametrize("unit", ["m^0.5", "rad/sqrt(h)", "px"])
+def test_what_has_no_whole_exponent_or_no_base_has_no_base_units(unit):
+    assert base_units(unit) is None
+
+
 def test_what_is_no_unit_or_no_pure_factor_is_refused():
     with pytest.raises(ConfigurationError, match="'metre per' is not a unit"):
         conversion_factor("metre per", "m")
@@ -71,28 +98,6 @@ def test_a_common_mistake_is_answered(source, target, advice):
     a, b = Output(unit=source), Input(unit=target)
     with pytest.raises(WiringError, match=advice):
         check_connection("a.y", a, "b.u", b)
-
-
-@pytest.mark.parametrize(
-    ("unit", "factor", "exponents"),
-    [
-        ("m/s^2", 1.0, {"m": 1, "s": -2}),
-        ("km", 1e3, {"m": 1}),
-        ("1/km^2", 1e-6, {"m": -2}),
-        ("mN*km", 1.0, {"kg": 1, "m": 2, "s": -2}),
-        ("g/cm^3", 1e3, {"kg": 1, "m": -3}),
-        ("deg/h", np.pi / 180 / 3600, {"rad": 1, "s": -1}),
-        ("rad^2*s", 1.0, {"rad": 2, "s": 1}),
-        ("m/s^0.5", None, None),  # FMI has whole exponents alone
-        ("px", None, None),
-    ],
-)
-def test_units_in_base_units_as_fmi_has_them(unit, factor, exponents):
-    found = base_units(unit)
-    if factor is None:
-        assert found is None
-    else:
-        assert found == (pytest.approx(factor, rel=1e-14), exponents)
 
 
 def factor(a, b):
@@ -131,6 +136,12 @@ def test_factors_by_port():
             Input(unit="km", dtype=np.int64),
             "only float64 ports are converted",
         ),
+        (
+            MessageOutput((4,), ragged=True),
+            MessageInput((4,)),
+            "one side is ragged, the other is not",
+        ),
+        (Output(), MessageInput(), "a signal cannot feed a message: a message has a time"),
         (Input(), Input(), "a.y'? is an input; a connection goes from an output"),
         (Output(), Output(), "b.u'? is an output; a connection ends at an input"),
         (
@@ -214,25 +225,6 @@ class Part(Component):
 def test_numbers_are_read_with_their_units(name, value, read):
     part = Part(**{name: value})
     np.testing.assert_allclose(part.setting(name), read, rtol=1e-15)
-
-
-class Bounded(Component):
-    """Bounds are among what is taken; what is positive is beyond zero."""
-
-    share = Parameter(0.5, minimum=0.25, maximum=0.75)
-    n = Count(2, minimum=1, maximum=9)
-
-
-@pytest.mark.parametrize(
-    ("name", "inside", "outside"),
-    [("share", (0.25, 0.75), (0.2499999, 0.7500001)), ("n", (1, 9), (0, 10))],
-)
-def test_bounds_are_taken_and_nothing_beyond(name, inside, outside):
-    for value in inside:
-        assert Bounded(**{name: value}).setting(name) == value
-    for value in outside:
-        with pytest.raises(ConfigurationError, match=r"it must be at (least|most)"):
-            Bounded(**{name: value})
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,12 @@ import pytest
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.component import Component, docstring
+from terrafix.cosim.declare.display import (
+    port_content,
+    port_table,
+    setting_content,
+    setting_table,
+)
 from terrafix.cosim.declare.parameters import (
     Choice,
     Count,
@@ -25,6 +31,7 @@ from terrafix.cosim.declare.ports import (
     MessageInput,
     MessageOutput,
     Output,
+    Port,
     SharedInput,
     State,
     WindowInput,
@@ -247,6 +254,52 @@ def test_a_constructor_of_its_own_keeps_its_signature():
 
     assert list(inspect.signature(Own).parameters) == ["plan"]
     assert list(inspect.signature(Component).parameters) == ["rate", "settings"]
+
+
+# ---------------------------------------------------------------------- listings
+
+
+def test_the_table_of_ports_says_of_each_field_what_was_declared():
+    ports = {n: p for n, p in Meter.declarations.items() if isinstance(p, Port)}
+    ports["image"] = SharedInput((None, 2), dtype=np.complex64, doc="seen")
+    ports["outline"] = MessageOutput((4, 2), unit=("m", "s"), ragged=True)
+    table = port_table([port_content(name, port) for name, port in ports.items()])
+    assert table.headers == ["port", "", "shape", "unit", "frame", "read at", "meaning"]
+    assert table.rows == [
+        ["truth", "input", "3", "m", "e", "end", "what is so"],
+        ["prior", "input", "", "", "", "start", "what was thought"],
+        ["  .r", "", "3", "m", "e", "", "position"],
+        ["  .v", "", "3", "m/s", "e", "", "rate of it"],
+        ["note", "input message", "2", "s", "", "end, optional", ""],
+        ["reading", "output", "scalar", "m", "", "", "what is read"],
+        ["image", "input shared", "any x 2 complex64", "1", "", "end", "seen"],
+        ["outline", "output message", "4 x 2 at most", "m, s", "", "", ""],
+    ]
+
+
+def test_the_table_of_parameters_says_what_each_takes():
+    """Defaults as they are written in a system file."""
+    content = [setting_content(name, setting) for name, setting in Meter.settings().items()]
+    assert setting_table(content).rows == [
+        ["mode", '"fast" | "slow"', "fast", "how"],
+        ["sigma", "number [m]", "required", "white noise"],
+        ["lever", "array (3,) [m]", "[1.0, 0.0, 25000000.0] m", "where it sits"],
+        ["many", "array (4, 4)", str(np.zeros((4, 4)).tolist()), ""],
+        ["quiet", "flag", "False", "say nothing"],
+    ]
+
+
+def test_a_port_is_told_in_plain_types():
+    declared = MessageInput((3,), unit=("m", "m", "s"), labels="xyz", queue=4, default=[1, 2, 3])
+    told = port_content("fix", declared)
+    assert (told["kind"], told["direction"], told["queue"]) == ("message", "input", 4)
+    assert (told["at"], told["optional"], told["default"]) == ("end", True, [1, 2, 3])
+    (field,) = told["fields"]
+    assert (field["shape"], field["unit"]) == ([3], ["m", "m", "s"])
+    assert (field["labels"], field["dtype"]) == (["x", "y", "z"], "float64")
+    assert port_content("w", WindowInput())["kind"] == "window"
+    assert "queue" not in port_content("u", Input())
+    assert "at" not in port_content("y", Output())
 
 
 # ---------------------------------------------------------------------- completion

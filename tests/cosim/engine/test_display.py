@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.engine.display import result_tables
+from terrafix.cosim.engine.display import records_table, result_tables
 from terrafix.cosim.engine.result import Result
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
@@ -64,6 +64,27 @@ def test_angles_ratios_consistency_and_fixes():
     assert "gate" in shown
 
 
+def test_fixes_are_counted_by_reason_also_where_members_differ():
+    """A reason counts once for each fix it was given in; the accepted part is a mean of fixes."""
+    assert "fixes 2, accepted 75.0%; accepted: 2, gate: 1\n" in text(NAVIGATION)
+    fixes = [{"accepted": True}, {"accepted": False, "reason": "gate"}, {"reason": "lost"}]
+    assert "fixes 3, accepted 50.0%; gate: 1, lost: 1\n" in text({"fixes": fixes})
+    assert "of epochs inside" in text(NAVIGATION)
+    assert ", 99% of epochs inside" in text(NAVIGATION)  # 0.986
+
+
+def test_the_columns_are_predicted_sample_and_their_ratio_or_error_over_sigma():
+    """1 m at 2 m predicted and 3 m of the sample: 1.50, or 0.50 where there is no sample."""
+    place = {"unit": "m", "axes": ["x"], "error": [1.0]}
+    place |= {"sigma_predicted": [2.0], "sigma_sample": [3.0]}
+    for members, row in ((2, ["1.000", "2.000", "3.000", "1.50"]), (1, ["1.000", "2.000", "0.50"])):
+        lines = text({"place": place}, members=members).splitlines()
+        (found,) = (line.split() for line in lines if line.split()[:1] == ["place"])
+        assert found == ["place", "x", "m", *row]
+    place["sigma_predicted"] = [0.0]
+    assert text({"place": place}).split()[-1] == "-"
+
+
 def test_one_member_has_no_sample_columns_with_numbers():
     single = {
         "place": {
@@ -85,6 +106,37 @@ def test_failed_members_and_overruns_are_named():
     assert "predict" in shown
     assert "result is not finite" in shown
     assert "ekf.fix" in shown
+
+
+@pytest.mark.parametrize(("count", "named"), [(8, "0, 1, 2, 3, 4, 5, 6, 7"), (9, "0, 1, 2, 3, 4,")])
+def test_failures_are_grouped_by_component_and_reason_with_their_first_and_last_time(count, named):
+    """Eight members are named, more are not."""
+    about = {"component": "filter", "reason": "diverged"}
+    excluded = [about | {"member": k, "t_s": 20.0 - k} for k in range(count)]
+    excluded += [about | {"member": 50, "t_s": 5.0, "reason": "lost"}]
+    shown = " ".join(text({}, excluded=excluded).split())
+    assert f"excluded {count + 1} of 100 members" in shown
+    assert f"{count} in 'filter' at t = {21 - count} to 20 s: diverged (members {named}" in shown
+    assert ("7, ...)" in shown) == (count > 8)
+    assert "1 in 'filter' at t = 5 s: lost (member 50)" in shown
+
+
+def test_a_run_that_ended_early_says_so():
+    assert "failed: no power" in text({}, status="failed: no power\n  at t = 3 s")
+    assert "at t = 3 s" not in text({}, status="failed: no power\n  at t = 3 s")
+    assert "complete" not in text({})
+
+
+def test_below_an_evaluation_four_records_are_listed_and_the_rest_counted(toys):
+    system = toys.wire({f"c{k}": toys.Clock() for k in range(6)}, [])
+    for k in range(6):
+        system.record(f"r{k}", f"c{k}.t")
+    dataset = simulate(system, duration=1).dataset
+    (_, table, more) = records_table(dataset, brief=True)
+    assert [row[0] for row in table.rows] == ["c0.t", "c1.t", "c2.t", "c3.t"]
+    assert str(more) == "and 2 more"
+    (_, table) = records_table(dataset, brief=False)
+    assert len(table.rows) == 6
 
 
 def test_several_evaluations_stand_one_under_another():

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError, StepError
+from terrafix.cosim.basics.errors import ConfigurationError, RateError, StepError
+from terrafix.cosim.basics.noise import NormalStream
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Input, Output
 from terrafix.cosim.engine.run import RunError, simulate
@@ -192,6 +193,19 @@ def test_every_due_component_steps_once_per_activation(toys):
     assert simulation.master.component_steps == sum(map(len, times.values())) + 6
 
 
+@pytest.mark.parametrize("others", [(3,), (3, 5), (3, 5, 7), (7, 5, 3), (4, 6, 3)])
+@pytest.mark.parametrize("first", ["a", "z"])  # stands before and after the others
+def test_all_that_is_due_at_a_tick_steps_in_one_order(toys, others, first):
+    """x (1 s) -> y (2 s) -> w (1 s): at t, w sees the last even second, whoever else is due."""
+    last = toys.EndSpy()
+    parts = {f"m{k}": toys.Clock(rate=Rate(period)) for k, period in enumerate(others)}
+    names = [f"{first}{n}" for n in "xyw"]
+    parts |= dict(zip(names, (toys.Clock(), toys.EndSpy(rate=Rate(2)), last), strict=True))
+    x, y, w = names
+    toys.fly(toys.wire(parts, [f"{x}.t -> {y}.u", f"{y}.echo -> {w}.u"]), 60)
+    assert last.values() == [(t, t - t % 2) for t in range(1, 61)]
+
+
 def test_a_run_in_pieces_is_the_run_in_one(toys):
     whole = toys.fly(noisy(toys), 12, members=3)
     pieces = Simulation(noisy(toys), members=3)
@@ -214,6 +228,131 @@ def test_a_step_error_raised_by_a_component_is_named_too(toys):
 
     with pytest.raises(StepError, match=r"'o' failed at t = 1 s \(tick 1\)\n  no convergence"):
         toys.fly(toys.wire({"o": Own()}, []), 1)
+
+
+# ---------------------------------------------------------------------- numbers of a run
+
+
+@pytest.mark.parametrize("seed", [0, 3, 3 + 2**32, 2**64 + 1])
+def test_draws_are_those_of_seed_path_stream_member_and_step(toys, seed):
+    """Walk adds sqrt(dt) times the numbers of its stream: here summed without a simulation."""
+    members = [9, 2, 5]
+    walk = toys.Walk(rate=Rate(4))
+    system = System("s", seed=77)
+    inner = System("inner")
+    inner.add(walk, "walk")
+    system.add(inner, "nav")
+    toys.fly(system, 12, members=members, seed=seed)
+    stream = NormalStream(seed, "nav.walk", "walk", members)
+    x = np.zeros((3, 2))
+    for step in (1, 2, 3):
+        x = x + 2.0 * stream.draw(step, 2)
+    np.testing.assert_array_equal(walk.x, x)
+
+
+def test_two_streams_and_two_lengths_of_one_stream_are_drawn_apart(toys):
+    class Two(toys.Clock):
+        def _step_impl(self, t, dt):
+            self.drawn = [self.normals(*what) for what in (("a", 1), ("a", 3), ("b", 1))]
+
+    two = Two()
+    toys.fly(toys.wire({"c": two}, []), 2, seed=5)
+    for drawn, what in zip(two.drawn, (("a", 1), ("a", 3), ("b", 1)), strict=True):
+        expected = NormalStream(5, "c", what[0], [0]).draw(2, what[1])
+        np.testing.assert_array_equal(drawn, expected)
+
+
+def test_a_system_says_seed_and_members_unless_told_otherwise(toys):
+    system = toys.wire({"c": toys.Clock()}, [], seed=3, members=2)
+    assert (Simulation(system).seed, len(Simulation(system).members)) == (3, 2)
+    assert Simulation(system, seed=0).seed == 0
+    assert Simulation(system, members=[4]).members.tolist() == [4]
+    with pytest.raises(ConfigurationError, match="members is 0; an ensemble has at least 1"):
+        Simulation(system, members=0)
+    with pytest.raises(ConfigurationError, match=r"members \[\] must be different whole numbers"):
+        Simulation(system, members=[])
+
+
+def test_records_can_be_left_out(toys):
+    system = toys.wire({"c": toys.Clock()}, [], ["c.t"])
+    assert [r.name for r in Simulation(system).recorders] == ["c_t"]
+    assert Simulation(system, recording=False).recorders == []
+
+
+def test_the_nominal_run_draws_no_noise_and_no_dispersion(toys):
+    walk = toys.Walk(start=[3.0, 4.0])
+    system = toys.wire({"w": walk}, [])
+    system.disperse(Dispersion("d", ("w.start",), 100.0))
+    toys.fly(system, 5, members=2, quiet=True)
+    assert walk.x.tolist() == [[3, 4], [3, 4]]
+
+
+def test_failures_are_told_by_the_members_numbers(toys):
+    system = toys.wire({"part": toys.Failing()}, [], duration=5)
+    (failure,) = simulate(system, members=[7, 1, 3]).excluded
+    assert (failure["member"], failure["t_s"]) == (1, 3.0)
+
+
+def test_the_last_to_fail_is_named(toys):
+    class Fading(toys.Clock):
+        def _step_impl(self, t, dt):
+            self.fail(self.environment.members == 10 - t, f"at {t:g}")
+
+    system = toys.wire({"part": Fading()}, [], duration=9)
+    with pytest.raises(RunError, match=r"no member is left at t = 3 s .*\n.* member 7, .*: at 3"):
+        simulate(system, members=[9, 8, 7])
+
+
+def test_the_first_failure_to_terminate_is_named_and_all_are_given_back(toys):
+    class Stubborn(toys.Clock):
+        def terminate(self):
+            raise OSError(f"{self.name} is open")
+
+    system = toys.wire({k: Stubborn() for k in "abc"}, [])
+    simulation = toys.fly(system, 1)
+    with pytest.raises(StepError, match=r"'a' failed at t = 1 s \(tick 1\)\n  OSError: a is open"):
+        simulation.master.terminate()
+    assert [c.lent for c in system.nodes.values()] == [None] * 3
+
+
+def test_a_start_read_is_recorded_a_step_later_than_its_source(toys):
+    """At tick k it publishes what the source published at k - 1; of t = 0, its own start."""
+    spy = toys.StartSpy()
+    system = toys.wire(
+        {"m": toys.Clock(), "s": spy},
+        [
+            "m.t -> s.u",
+        ],
+        ["s.echo"],
+    )
+    data = toys.fly(system, 4).result(wall_s=0.0).dataset
+    assert data["s.echo"].values[:, 0].tolist() == [0, 0, 1, 2, 3]
+
+
+def test_a_run_reports_its_progress_up_to_the_end(toys):
+    """1000 ticks in slices of 2, their 400th part in whole ticks; the last of them the whole."""
+    told = []
+    system = toys.wire({"c": toys.Clock(rate=Rate("0.01"))}, [], duration=10)
+    simulate(system, progress=lambda what, part: told.append((what, part)))
+    assert [part for what, part in told if what == "running"] == [k / 500 for k in range(1, 501)]
+
+
+def test_a_duration_of_more_ticks_than_can_be_flown_is_refused(toys, monkeypatch):
+    monkeypatch.setattr("terrafix.cosim.engine.run.MAX_TICKS", 50)
+    system = toys.wire({"c": toys.Clock(rate=Rate("0.1"))}, [])
+    assert simulate(system, duration=5).ticks == 50
+    with pytest.raises(RateError, match=r"duration is 5\.1 s at a base step of 0\.1 s: 51 ticks"):
+        simulate(system, duration="5.1")
+
+
+def test_members_that_do_not_fit_into_memory_are_refused(toys, monkeypatch):
+    """One port of 8 bytes: 0.8 * 4096 bytes hold 409 members."""
+    sizes = {"SC_PAGE_SIZE": 1024, "SC_PHYS_PAGES": 4}
+    monkeypatch.setattr("os.sysconf", sizes.__getitem__)
+    system = toys.wire({"c": toys.Clock()}, [])
+    assert len(Simulation(system, members=409).members) == 409
+    with pytest.raises(ConfigurationError, match="410 members need more than 0 GiB"):
+        Simulation(system, members=410)
 
 
 class Idle(Component):

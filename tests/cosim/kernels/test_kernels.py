@@ -6,6 +6,7 @@ import os
 import stat
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -470,6 +471,28 @@ def test_libraries_are_compiled_once(counted):
     assert stepped() == first
     assert counted() == 1
     assert len(libraries()) == 1
+
+
+@posix
+@needs_compiler
+def test_a_library_is_made_anew_for_whatever_it_depends_on(counted, monkeypatch):
+    """Source, options, compiler; the processor where it is for that alone, and only there."""
+    source = '__attribute__((visibility("default"))) char terrafix_key[] = TERRAFIX_KEY;\n'
+    compiler = toolchain.find_compiler()
+
+    def compiled(text=source, *, native=False):
+        toolchain.load(text, native=native)
+        return counted()
+
+    assert [compiled(), compiled(), compiled(source + "int more;\n")] == [1, 1, 2]
+    assert [compiled(native=True), compiled(native=True)] == [3, 3]
+    monkeypatch.setattr(toolchain, "cpu_features", lambda: "another processor")
+    assert [compiled(), compiled(native=True)] == [3, 4]
+    monkeypatch.setattr(toolchain, "FLAGS", (*toolchain.FLAGS, "-DMORE"))
+    assert [compiled(), compiled(native=True)] == [5, 5]
+    other = replace(compiler, version="another version")
+    monkeypatch.setattr(toolchain, "_identify", lambda command: other)
+    assert [compiled(), compiled(native=True)] == [6, 7]
 
 
 @posix

@@ -43,6 +43,8 @@ def test_messages_that_were_replaced_before_they_were_read_are_counted(toys):
     )
     result = simulate(system, members=2)
     assert result.overruns == {"read.note": 2 * 2 * 3}
+    system = toys.wire({"send": toys.Sender(), "read": toys.Reader()}, LINK, duration=9)
+    assert simulate(system, members=2).overruns == {}
 
 
 def test_a_message_reaches_the_members_it_is_valid_for(toys):

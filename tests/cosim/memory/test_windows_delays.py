@@ -7,6 +7,7 @@ from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, RateError, WiringError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Input, Output, WindowInput
+from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.system import System
 
 
@@ -40,6 +41,28 @@ def test_windows_grow_and_start_empty_again(toys):
     toys.fly(toys.wire(parts, ["c.t -> w.u"]), 3)
     assert [len(times) for _, _, (_, times) in spy.seen] == [59, 0, 1]
     np.testing.assert_array_equal(spy.seen[0][2][0][0], np.arange(1, 60) / 100)
+
+
+def test_a_window_that_grew_is_put_back(toys):
+    """59 samples where room was made for 16, saved before the consumer's step and set back."""
+
+    def built():
+        burst = [f"{k}/100" for k in range(1, 60)]
+        parts = {
+            "c": toys.Clock(rate=Rate(times=burst)),
+            "w": toys.WindowSpy(),
+            "fine": toys.Clock(rate=Rate("0.01")),
+        }
+        return toys.wire(parts, ["c.t -> w.u"])
+
+    saved = toys.fly(built(), "0.7").get_state()
+    resumed = Simulation(built())
+    resumed.set_state(saved)
+    resumed.run_until(1)
+    ((t, _, (samples, times)),) = resumed.system.nodes["w"].seen
+    assert t == 1
+    np.testing.assert_array_equal(times, np.arange(1, 60) / 100)
+    np.testing.assert_array_equal(samples[0], np.arange(1, 60) / 100)
 
 
 def test_an_unconnected_window_with_a_default_is_empty(toys):

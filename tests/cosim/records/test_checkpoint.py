@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import CheckpointError
+from terrafix.cosim.basics.errors import CheckpointError, RateError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import (
     Capabilities,
@@ -23,6 +23,7 @@ from terrafix.cosim.declare.ports import (
 from terrafix.cosim.engine.run import RunError, simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
+from terrafix.cosim.records.recorder import read_chunks
 from terrafix.cosim.records.results import read_result
 from terrafix.cosim.system.dispersion import Dispersion
 
@@ -164,6 +165,83 @@ def test_resuming_does_not_touch_what_was_recorded(toys, tmp_path, monkeypatch):
     assert toys.payload(again.dataset) == whole
 
 
+def test_checkpoints_are_written_at_every_multiple_of_the_interval(toys, tmp_path, monkeypatch):
+    """Of 10 s, every 4 s: at 4 and 8; at the end where it is a multiple, in ticks of the step."""
+    for every, step, expected in ((4, 1, [4, 8]), (5, 1, [5, 10]), ("2.5", "0.5", [5, 10, 15, 20])):
+        ticks = []
+
+        def write(path, content, ticks=ticks):
+            ticks.append(content["master"]["tick"])
+            write_checkpoint(path, content)
+
+        monkeypatch.setattr("terrafix.cosim.engine.run.write_checkpoint", write)
+        made = toys.wire({"c": toys.Clock(rate=Rate(step))}, [], duration=10)
+        simulate(made, checkpoint=tmp_path / "c.ckpt", checkpoint_every=every)
+        assert ticks == expected
+    with pytest.raises(RateError, match="checkpoint interval is 0 s; it must be positive"):
+        simulate(made, checkpoint=tmp_path / "c.ckpt", checkpoint_every=0)
+
+
+def test_a_run_is_resumed_to_the_time_of_its_checkpoint_and_no_earlier(toys, interrupted):
+    """The last checkpoint every 4 s before t = 13 s is that of 12 s."""
+    with pytest.raises(CheckpointError, match="is at t = 12 s, beyond the duration of 11 s"):
+        simulate(system(toys), resume=interrupted, duration=11)
+    result = simulate(system(toys), resume=interrupted, duration=12)
+    whole = simulate(system(toys), duration=12)
+    assert toys.payload(result.dataset) == toys.payload(whole.dataset)
+
+
+@pytest.mark.parametrize("folder", [True, False])
+def test_samples_after_a_state_are_dropped_and_taken_again(toys, tmp_path, folder):
+    """From 6 s back to 3 s and on to 5 s: the times are 0 to 5, in memory and in files."""
+    made = toys.wire({"c": toys.Clock()}, [], ["c.t"])
+    simulation = Simulation(made, folder=tmp_path / "parts" if folder else None)
+    simulation.run_until(2)
+    simulation.recorders[0].flush()
+    simulation.run_until(3)
+    saved = simulation.get_state()
+    assert saved["recorders"]["c_t"]["n_samples"] == 4
+    simulation.run_until(4)
+    simulation.recorders[0].flush()
+    simulation.run_until(6)
+    simulation.set_state(saved)
+    simulation.run_until(5)
+    times, arrays = simulation.recorders[0].history()
+    assert times.tolist() == arrays["c.t"][:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_files_of_samples_are_cut_within_one(toys, tmp_path):
+    """Files of 3 and 4 samples, put back to 5: what is left of the second is 2, then 1 new."""
+    made = toys.wire({"c": toys.Clock()}, [], ["c.t"])
+    simulation = toys.fly(made, 2, folder=tmp_path / "parts")
+    (recorder,) = simulation.recorders
+    recorder.flush()
+    simulation.run_until(6)
+    recorder.flush()
+    recorder.set_state(recorder.get_state() | {"n_samples": 5})
+    recorder.sample(9.0)
+    assert recorder.history()[0].tolist() == [0, 1, 2, 3, 4, 9]
+    assert [len(t) for t, _ in read_chunks(tmp_path / "parts", "c_t")] == [3, 2, 1]
+
+
+def test_a_message_is_recorded_once_also_across_a_checkpoint(toys):
+    """Sent at t = 3; the record of t = 4, after the state was set, has nothing new."""
+    plan = lambda step, members: np.full(len(members), step == 3)  # noqa: E731 - reads as data
+
+    def made():
+        return toys.wire({"s": toys.Sender(plan)}, [], ["s.note"])
+
+    saved = toys.fly(made(), 3).get_state()
+    other = Simulation(made())
+    other.initialize()
+    other.set_state(
+        saved | {"recorders": {"s_note": {**saved["recorders"]["s_note"], "n_samples": 1}}}
+    )
+    other.run_until(5)
+    _, arrays = other.recorders[0].history()
+    assert np.isnan(arrays["s.note.t"]).all()
+
+
 SCRIPT = """
 import importlib.util, os, signal, sys
 
@@ -301,6 +379,7 @@ def test_what_is_saved_is_read_back_with_its_types(tmp_path):
         "a": np.arange(6, dtype=np.int32).reshape(2, 3),
         "empty": np.zeros((0, 4)),
         "none": None,
+        "scalars": [np.int64(2**60 + 1), np.bool_(True)],  # more digits than a float has
         "nested": {"list": [1, 2.5, "x", True, np.float64(3)], "mask": np.array([True, False])},
         "nan": float("nan"),
         "big": 2**70,
@@ -312,6 +391,8 @@ def test_what_is_saved_is_read_back_with_its_types(tmp_path):
     assert found["empty"].shape == (0, 4)
     assert found["nested"]["list"] == [1, 2.5, "x", True, 3.0]
     assert found["nested"]["mask"].tolist() == [True, False]
+    assert found["scalars"] == [2**60 + 1, True]
+    assert found["scalars"][1] is True
     assert found["nan"] != found["nan"]
     assert (found["none"], found["big"]) == (None, 2**70)
 

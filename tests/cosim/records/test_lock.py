@@ -18,13 +18,15 @@ HOLD = """
     sys.stdin.read()
 """
 CONTEND = """
-    import os, random, sys, time
+    import os, sys
     from pathlib import Path
     from terrafix.cosim.basics.errors import ConfigurationError
     from terrafix.cosim.records.places import locked, unlock
     folder, token = Path(sys.argv[1]), Path(sys.argv[1] + ".token")
-    held, until = 0, time.monotonic() + float(sys.argv[2])
-    while time.monotonic() < until:
+    print("ready", flush=True)
+    sys.stdin.readline()
+    held = 0
+    while held < int(sys.argv[2]):
         try:
             lock = locked(folder)
         except ConfigurationError:
@@ -33,7 +35,6 @@ CONTEND = """
         token.unlink()
         unlock(lock)
         held += 1
-    print(held)
 """
 
 
@@ -64,10 +65,15 @@ def test_a_lock_is_for_one_process(tmp_path):
 def test_two_never_hold_it_though_its_file_comes_and_goes(tmp_path):
     folder = tmp_path / "run.parts"
     (tmp_path / "run.parts.lock").touch()  # left by one that died
-    contenders = [python(CONTEND, folder, 1.5, stderr=subprocess.PIPE) for _ in range(4)]
+    pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
+    contenders = [python(CONTEND, folder, 200, **pipes) for _ in range(4)]
+    assert [each.stdout.readline() for each in contenders] == ["ready\n"] * 4
+    for each in contenders:  # all at once, when all are there
+        each.stdin.write("go\n")
+        each.stdin.flush()
     done = [each.communicate(timeout=60) for each in contenders]
     assert [error for _, error in done] == [""] * 4
-    assert sum(int(held) for held, _ in done) > 100
+    assert [each.returncode for each in contenders] == [0] * 4
     assert not list(tmp_path.iterdir())
 
 

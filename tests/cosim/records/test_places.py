@@ -1,11 +1,10 @@
 """Files of a run: nobody else writes there, nothing is lost, a resumed run finds its own."""
 
 import runpy
-import signal
 import subprocess
 import sys
 import textwrap
-import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,12 +14,12 @@ from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Output
 from terrafix.cosim.engine.run import RunError, simulate
+from terrafix.cosim.records.places import Places
 from terrafix.cosim.records.results import read_result
 from terrafix.cosim.system.system import System
 
 SLOW = """
-    import time
-    from pathlib import Path
+    import sys
     from terrafix.cosim.declare.component import Component
     from terrafix.cosim.basics.clock import Rate
     from terrafix.cosim.declare.ports import Output, State
@@ -38,8 +37,9 @@ SLOW = """
         def _step_impl(self, t, dt):
             self.x += self.normals("w", 1)[:, 0]
             self.y = self.x
-            while t == 60 and Path(HOLD).exists():
-                time.sleep(0.01)
+            if t == 60 and sys.argv[1:] == ["hold"]:
+                print("held", flush=True)
+                sys.stdin.readline()
 
     system = System("slow", duration="300")
     system.add(Slow(), "s")
@@ -48,33 +48,27 @@ SLOW = """
 
 
 def script(folder, call):
-    """How to run the system in a process, which waits at t = 60 while there is a file "hold"."""
+    """How to run the system in a process; with "hold" it waits at t = 60 for a line."""
     file = folder / "slow.py"
-    file.write_text(f"HOLD = {str(folder / 'hold')!r}\n{textwrap.dedent(SLOW)}{call}\n")
+    file.write_text(f"{textwrap.dedent(SLOW)}{call}\n")
     return [sys.executable, str(file)]
 
 
 def held(folder, call):
-    """The same, started and on its way to wait."""
-    (folder / "hold").touch()
-    return subprocess.Popen(script(folder, call))
-
-
-def wait_for(path):
-    deadline = time.monotonic() + 60
-    while not path.exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    """The same, started and waiting."""
+    command = [*script(folder, call), "hold"]
+    process = subprocess.Popen(command, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdout.readline() == "held\n"
+    return process
 
 
 def test_a_second_run_to_the_same_file_is_refused_while_the_first_writes(tmp_path, toys):
     out = tmp_path / "run.nc"
-    first = held(tmp_path, f"simulate(system, out={str(out)!r})")
-    wait_for(tmp_path / "run.nc.parts" / "manifest.json")
-    with pytest.raises(ConfigurationError, match="another run is writing its records to"):
-        simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
-    (tmp_path / "hold").unlink()
-    assert first.wait(60) == 0
+    with held(tmp_path, f"simulate(system, out={str(out)!r})") as first:
+        with pytest.raises(ConfigurationError, match="another run is writing its records to"):
+            simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
+        first.communicate("go on\n", timeout=60)
+    assert first.returncode == 0
     assert len(read_result(out)["time"]) == 301
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.nc", "slow.py"]
 
@@ -83,12 +77,10 @@ def test_a_resumed_run_finds_its_result_file_again(tmp_path):
     """Killed, then resumed without naming the result: same bytes as never stopped."""
     out, checkpoint = tmp_path / "run.nc", tmp_path / "run.ckpt"
     call = f"simulate(system, out={str(out)!r}, checkpoint_every='50')"
-    killed = held(tmp_path, call)
-    wait_for(checkpoint)
-    killed.send_signal(signal.SIGKILL)
-    killed.wait()
+    with held(tmp_path, call) as killed:
+        assert checkpoint.exists()  # of t = 50
+        killed.kill()
     assert not out.exists()
-    (tmp_path / "hold").unlink()
     resume = f"simulate(system, resume={str(checkpoint)!r})"
     subprocess.run(script(tmp_path, resume), check=True)
     whole = runpy.run_path(script(tmp_path, "whole = simulate(system)")[1])["whole"].dataset
@@ -100,10 +92,8 @@ def test_a_resumed_run_finds_its_result_file_again(tmp_path):
 def test_what_a_killed_run_left_is_kept_and_said(tmp_path, toys):
     out = tmp_path / "run.nc"
     call = f"simulate(system, out={str(out)!r}, checkpoint_every='50')"
-    killed = held(tmp_path, call)
-    wait_for(tmp_path / "run.ckpt")
-    killed.send_signal(signal.SIGKILL)
-    killed.wait()
+    with held(tmp_path, call) as killed:
+        killed.kill()
     result = simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
     kept = tmp_path / "run.nc.interrupted.nc"
     assert result.notes == [f"what an interrupted run had recorded is kept in '{kept}'"]
@@ -123,6 +113,43 @@ def test_what_is_damaged_beyond_reading_does_not_block_the_next(tmp_path, toys):
     assert len(read_result(out)["time"]) == 4
 
 
+@pytest.mark.parametrize(
+    ("options", "checkpoint", "folder", "told"),
+    [
+        ({"out": "a/run.nc"}, "a/run.ckpt", "a/run.nc.parts", ["run.nc", "run.nc.parts"]),
+        (
+            {"out": "a/run.nc", "checkpoint": "b/c.ckpt"},
+            "b/c.ckpt",
+            "a/run.nc.parts",
+            ["../a/run.nc", "../a/run.nc.parts"],
+        ),
+        ({"checkpoint": "b/c.ckpt"}, "b/c.ckpt", "b/c.ckpt.parts", [None, "c.ckpt.parts"]),
+        ({}, "name.ckpt", "name.ckpt.parts", [None, "name.ckpt.parts"]),
+        ({"checkpointing": False}, "name.ckpt", None, [None, None]),
+    ],
+)
+def test_places_are_named_after_the_result_or_the_checkpoint(options, checkpoint, folder, told):
+    """What a checkpoint tells of them is seen from its own folder: all can move together."""
+    given = {"out": None, "checkpoint": None} | {
+        k: v if isinstance(v, bool) else Path(v) for k, v in options.items()
+    }
+    places = Places.of_run("name", **{"checkpointing": True} | given)
+    assert places.checkpoint == Path(checkpoint)
+    assert places.folder == (folder and Path(folder))
+    assert places.described() == dict(zip(("out", "folder"), told, strict=True))
+    assert places.notes == (["checkpoints go to 'name.ckpt'"] if options == {} else [])
+
+
+def test_a_file_where_the_records_would_be_kept_is_refused(tmp_path, toys):
+    (tmp_path / "run.nc.parts").write_text("somebody's")
+    system = toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3")
+    with pytest.raises(
+        ConfigurationError, match="but a file of that name is there\n  move it away"
+    ):
+        simulate(system, out=tmp_path / "run.nc")
+    assert (tmp_path / "run.nc.parts").read_text() == "somebody's"
+
+
 def test_a_failed_run_does_not_replace_an_earlier_result(tmp_path, toys):
     out = tmp_path / "run.nc"
     simulate(toys.wire({"c": toys.Clock()}, [], ["c.t"], duration="3"), out=out)
@@ -137,6 +164,16 @@ def test_a_failed_run_does_not_replace_an_earlier_result(tmp_path, toys):
         simulate(broken, out=out)
     assert caught.value.result.out == tmp_path / "run.failed.nc"
     assert out.read_bytes() == before
+
+
+def test_a_failed_run_takes_the_name_of_the_result_where_there_was_none(tmp_path, toys):
+    """What it recorded until t = 2 s; the next failure does not replace that."""
+    for out in ("run.nc", "run.failed.nc"):
+        broken = toys.wire({"f": toys.Failing("raise")}, [], ["f.y"], duration="5")
+        with pytest.raises(RunError) as caught:
+            simulate(broken, out=tmp_path / "run.nc")
+        assert caught.value.result.out == tmp_path / out
+        assert read_result(tmp_path / out)["time"].values.tolist() == [0, 1, 2]
 
 
 def test_a_result_that_cannot_be_written_keeps_its_records(tmp_path, toys, monkeypatch):

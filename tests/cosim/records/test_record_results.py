@@ -15,10 +15,11 @@ from terrafix.cosim.basics.errors import ConfigurationError, RateError, SystemCh
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.evaluation import Evaluation
 from terrafix.cosim.declare.parameters import Parameter
-from terrafix.cosim.declare.ports import BundleOutput, Output
+from terrafix.cosim.declare.ports import BundleOutput, MessageOutput, Output
 from terrafix.cosim.engine.run import RunError, simulate
 from terrafix.cosim.memory.fields import Field
-from terrafix.cosim.records.results import read_result, salvage
+from terrafix.cosim.records.recorder import read_chunks
+from terrafix.cosim.records.results import build_dataset, read_result, salvage
 
 
 class Rich(Component):
@@ -174,6 +175,106 @@ def test_a_wide_record_is_flushed_before_it_fills_the_memory(toys, tmp_path):
     )
 
 
+def test_a_chunk_holds_1024_samples_or_8_mib(toys, tmp_path):
+    """2500 samples, from 0 to 24.99 s, of 16 bytes: two whole chunks and 452."""
+    system = toys.wire({"c": toys.Clock(rate=Rate("0.01"))}, [], ["c.t"])
+    simulation = toys.fly(system, "24.99", folder=tmp_path / "parts")
+    (recorder,) = simulation.recorders
+    recorder.flush()
+    sizes = [len(t) for t, _ in read_chunks(tmp_path / "parts", "c_t")]
+    assert sizes == [1024, 1024, 452]
+
+
+def test_what_is_salvaged_is_labeled_as_the_result_would_be(toys, tmp_path):
+    """Units, frames, labels, meanings and types go through the folder's manifest."""
+    simulation = toys.fly(rich(toys), 4, members=[3, 1], folder=tmp_path / "parts")
+    for recorder in simulation.recorders:
+        recorder.flush()
+    saved, whole = salvage(tmp_path / "parts"), simulation.result(wall_s=0.0).dataset
+    assert set(saved.data_vars) == set(whole.data_vars)
+    for name, variable in saved.data_vars.items():
+        assert variable.identical(whole[name]), name
+    assert saved.attrs["status"] == "interrupted"
+    assert saved["member"].values.tolist() == [3, 1]
+
+
+def test_members_that_failed_are_nan_from_then_on_also_in_messages(toys):
+    class Quitter(toys.Sender):
+        def _step_impl(self, t, dt):
+            super()._step_impl(t, dt)
+            if t == 2:
+                self.fail(self.environment.members == 5, "gone")
+
+    system = toys.wire({"s": Quitter()}, [], ["s.note"], duration=4)
+    data = simulate(system, members=[5, 6]).dataset
+    assert np.isnan(data["s.note.t"].sel(member=5).values).tolist() == [
+        True,
+        False,
+        True,
+        True,
+        True,
+    ]
+    assert data["s.note.t"].sel(member=6).values[1:].tolist() == [1, 2, 3, 4]
+
+
+def test_attributes_are_texts_numbers_or_json():
+    given = {"text": "a", "n": 3, "list": [1, np.int64(2)], "array": np.eye(2), "path": [Path("a")]}
+    stored = build_dataset({}, np.arange(2), given).attrs
+    assert (stored["text"], stored["n"]) == ("a", 3)
+    assert stored["list"] == "[1, 2]"
+    assert stored["array"] == "[[1.0, 0.0], [0.0, 1.0]]"
+    assert stored["path"] == '["a"]'
+
+
+def test_where_no_ragged_message_came_its_count_is_zero(toys):
+    """Sent at 1 s and 3 s with as many elements as seconds; recorded at every second."""
+
+    class Ragged(Component):
+        default_rate = Rate("1")
+        note = MessageOutput((4,), ragged=True)
+
+        def _step_impl(self, t, dt):
+            if t % 2:
+                self.note.publish(t, 1.0, count=int(t))
+
+    data = simulate(toys.wire({"r": Ragged()}, [], ["r.note"], duration=4)).dataset
+    assert data["r.note.count"].values[:, 0].tolist() == [0, 1, 0, 3, 0]
+    assert np.isnan(data["r.note.t"].values[[0, 2, 4]]).all()
+
+
+def test_an_axis_of_many_labels_is_named_after_the_first_and_the_last(toys):
+    """axis_a0_..._a9 has 34 letters; with nine labels, 31."""
+
+    class Labeled(Component):
+        default_rate = Rate("1")
+        nine = Output((9,), labels=tuple(f"a{k}" for k in range(9)))
+        ten = Output((10,), labels=tuple(f"a{k}" for k in range(10)))
+        cube = Output((2, 2, 2))
+
+        def _step_impl(self, t, dt):
+            self.nine = self.ten = self.cube = t
+
+    data = simulate(
+        toys.wire({"x": Labeled()}, [], ["x.nine", "x.ten", "x.cube"], duration=1)
+    ).dataset
+    assert data["x.nine"].dims[2] == "axis_" + "_".join(f"a{k}" for k in range(9))
+    assert data["x.ten"].dims[2] == "axis_a0_to_a9"
+    assert data["x.cube"].dims[2:] == ("dim_2", "dim_2b", "dim_2bb")
+
+
+def test_records_share_a_time_axis_where_they_were_taken_at_the_same_times(toys):
+    parts = {"a": toys.Clock(), "b": toys.Clock(), "c": toys.Clock(rate=Rate(2))}
+    one = simulate(toys.wire(parts, [], ["a.t", "b.t"], duration=4)).dataset
+    assert one["a.t"].dims[0] == one["b.t"].dims[0] == "time"
+    two = toys.wire({k: toys.Clock(rate=c.rate) for k, c in parts.items()}, [], ["a.t", "b.t"])
+    two.record("c", ["c.t"])
+    two.record("again", ["a.t"], period=2)
+    data = simulate(two, duration=4).dataset
+    assert data["a.t"].dims[0] == data["b.t"].dims[0] == "time_a_t"
+    assert data["c.t"].dims[0] == data["a.t@again"].dims[0] == "time_c"
+    assert data["a.t@again"].values[:, 0].tolist() == [0, 2, 4]
+
+
 # ---------------------------------------------------------------------- a run that is killed
 
 SCRIPT = """
@@ -282,7 +383,7 @@ def test_durations_that_cannot_be_are_refused(toys):
     system = toys.wire({"c": toys.Clock()}, [])
     with pytest.raises(RateError, match="system 'test' has no duration; give one"):
         simulate(system)
-    with pytest.raises(RateError, match="duration is 0"):
+    with pytest.raises(RateError, match="duration is 0 s; it must be positive"):
         simulate(system, duration=0)
     with pytest.raises(RateError, match=r"duration is 0\.5 s, shorter than the base step of 1 s"):
         simulate(system, duration="0.5")

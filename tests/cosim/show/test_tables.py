@@ -43,6 +43,11 @@ def test_html_is_escaped_and_aligned():
     assert shown.count("text-align:left") == 6
 
 
+def test_lines_of_a_cell_stay_lines_in_html():
+    shown = Table(["a"], [["one\n<two>"]])._repr_html_()
+    assert "one<br>&lt;two&gt;</td>" in shown
+
+
 def test_groups_stand_apart():
     grouped = Table(["q", "axis"], [["p", "x"], ["", "y"], ["v", "x"]], grouped=True)
     assert str(grouped).splitlines()[2:] == ["p   x", "    y", "", "v   x"]

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, truncnorm, uniform
+from scipy import stats
 
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
+from terrafix.cosim.basics.noise import NormalStream
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.dispersion import Dispersion
@@ -60,58 +61,6 @@ def test_the_spread_is_the_standard_deviation_or_the_half_width(toys, kind):
     np.testing.assert_allclose(draws.std(axis=0), sigma, rtol=4 / np.sqrt(2 * n))
     assert kind == "normal" or np.abs(draws).max() < 1
     assert abs(np.corrcoef(draws.T)[0, 1]) < 4 / np.sqrt(n)
-
-
-def drawn(toys, spread, kind, n=4000, **options):
-    """Values of ekf.start, (n, 2), about 10 and 20 m."""
-    dispersion = Dispersion("d", ("ekf.start",), spread, kind, **options)
-    return starts(pair(toys, dispersion), members=n)["ekf"]
-
-
-def test_a_factor_is_spread_evenly_in_its_logarithm(toys):
-    """Between p / f and p f."""
-    logs = np.log(drawn(toys, [2.0, 5.0], "log_uniform") / [10, 20]) / np.log([2, 5])
-    assert kstest(logs[:, 0], uniform(-1, 2).cdf).pvalue > 1e-3
-    assert kstest(logs[:, 1], uniform(-1, 2).cdf).pvalue > 1e-3
-
-
-def test_a_truncated_draw_is_normal_within_its_limit(toys):
-    z = (drawn(toys, [100.0, 1.0], "truncated", limit=1.5) - [10, 20]) / [100, 1]
-    for column in z.T:
-        assert kstest(column, truncnorm(-1.5, 1.5).cdf).pvalue > 1e-3
-
-
-def test_correlated_draws_have_their_covariance_and_are_normal(toys):
-    """Whitened by the inverse of the lower Cholesky factor, they are independent."""
-    covariance = np.array([[4.0, -1.8], [-1.8, 1.0]])
-    e = drawn(toys, covariance, "multivariate") - [10, 20]
-    z = np.linalg.solve(np.linalg.cholesky(covariance), e.T)
-    assert abs(np.corrcoef(z)[0, 1]) < 4 / np.sqrt(4000)
-    for row in z:
-        assert kstest(row, "norm").pvalue > 1e-3
-
-
-def test_members_take_the_values_of_a_list_by_their_number(toys):
-    dispersion = Dispersion("d", ("ekf.start",), [[1, 2], [3, 4], [5, 6]], "list")
-    found = starts(pair(toys, dispersion), members=[5, 3, 7])["ekf"]
-    assert found.tolist() == [[5, 6], [1, 2], [3, 4]]  # 5, 3 and 7 modulo 3
-
-
-@pytest.mark.parametrize("design", ["latin_hypercube", "sobol"])
-def test_a_design_is_laid_out_over_all_runs_and_all_dispersions(toys, design):
-    """Each of 16 cells of each of four axes holds one of 16 members, whoever is flown."""
-    one = Dispersion("one", ("ekf.start",), [1.0, 1.0], "uniform", design)
-    two = Dispersion("two", ("ukf.start",), [1.0, 1.0], "uniform", design)
-
-    def cells(members):
-        found = starts(pair(toys, one, two), members=members, runs=16)
-        places = np.hstack([found["ekf"], found["ukf"]]) - [10, 20, 10, 20]
-        return np.floor((places + 1) * 8).astype(int)
-
-    whole = cells(16)
-    assert (np.sort(whole, axis=0) == np.arange(16)[:, None]).all()
-    assert len({tuple(column) for column in whole.T}) == 4
-    assert cells([9, 2]).tolist() == whole[[9, 2]].tolist()
 
 
 @pytest.mark.parametrize(
@@ -192,3 +141,126 @@ def test_a_draw_out_of_range_is_refused_and_nothing_stays_bound(toys):
 def test_dispersions_have_one_name_each(toys):
     with pytest.raises(ConfigurationError, match="has a dispersion 'initial_position' already"):
         pair(toys, BOTH, BOTH)
+
+
+# ---------------------------------------------------------------------- draws by their formulas
+
+
+UNIFORM = NormalStream(4, "dispersion", "d", np.arange(6)).uniform(0, 2)
+"""What the six members draw at seed 4: the tests apply the table of `dispersion` to it."""
+START = np.array([10.0, 20.0])
+
+
+def drawn(toys, spread, kind, members=range(6), **options):
+    dispersion = Dispersion("d", ("ekf.start", "ukf.start"), spread, kind, **options)
+    found = starts(pair(toys, dispersion), members=list(members), seed=4)
+    assert found["ekf"].tobytes() == found["ukf"].tobytes()
+    return found["ekf"]
+
+
+def test_draws_are_what_the_table_says(toys):
+    """SciPy's quantile of the normal distribution and its truncated one, and plain powers."""
+    sigma = np.array([100.0, 1.0])
+    u, z = UNIFORM, stats.norm.ppf(UNIFORM)
+    close = {"rtol": 1e-13, "atol": 1e-12}
+    np.testing.assert_allclose(drawn(toys, sigma, "normal"), START + sigma * z, **close)
+    np.testing.assert_allclose(drawn(toys, sigma, "uniform"), START + sigma * (2 * u - 1), **close)
+    factor = np.array([2.0, 5.0])
+    expected = START * factor ** (2 * u - 1)
+    np.testing.assert_allclose(drawn(toys, factor, "log_uniform"), expected, **close)
+    for options, limit in (({}, 3.0), ({"limit": 0.5}, 0.5)):
+        truncated = START + sigma * stats.truncnorm.ppf(u, -limit, limit)
+        found = drawn(toys, sigma, "truncated", **options)
+        np.testing.assert_allclose(found, truncated, rtol=1e-10)
+        assert (np.abs(found - START) < limit * sigma).all()
+
+
+def test_a_multivariate_draw_has_the_covariance_that_was_given(toys):
+    """By hand, [[4, 3], [3, 9]] has the factor [[2, 0], [1.5, sqrt(6.75)]]."""
+    z = stats.norm.ppf(UNIFORM)
+    expected = START + np.column_stack([2 * z[:, 0], 1.5 * z[:, 0] + np.sqrt(6.75) * z[:, 1]])
+    found = drawn(toys, [[4.0, 3.0], [3.0, 9.0]], "multivariate")
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+    metric = drawn(toys, "[[4e-6, 3e-6], [3e-6, 9e-6]] km^2", "multivariate")
+    np.testing.assert_allclose(metric, expected, rtol=1e-12)
+
+
+def test_a_list_is_taken_in_turn_by_the_members_numbers(toys):
+    """Member m takes value m mod 3, whoever else flies; in place of the parameter, not added."""
+    values = ["[1, 2] m", "[0.3, 0.4] km", [5.0, 6.0]]
+    found = drawn(toys, values, "list", members=[5, 0, 4])
+    assert found.tolist() == [[5, 6], [1, 2], [300, 400]]
+    text = "[[1, 2], [300, 400], [5, 6]] m"
+    assert drawn(toys, text, "list", members=[5, 0, 4]).tolist() == found.tolist()
+
+
+@pytest.mark.parametrize(("design", "n"), [("latin_hypercube", 10), ("sobol", 8)])
+def test_designs_put_one_member_into_each_cell_of_every_dimension(toys, design, n):
+    """Two dispersions of two dimensions each: n members in n equal cells, in all four."""
+    both = (
+        Dispersion("a", ("ekf.start",), 1.0, "uniform", design),
+        Dispersion("b", ("ukf.start",), 1.0, "uniform", design),
+    )
+    whole = starts(pair(toys, *both), members=n, seed=4)
+    columns = np.column_stack([whole["ekf"] - START, whole["ukf"] - START])
+    cells = np.floor((columns + 1) / 2 * n).astype(int)
+    assert [sorted(column) for column in cells.T.tolist()] == [list(range(n))] * 4
+    assert len({tuple(column) for column in cells.T.tolist()}) == 4  # no two dimensions alike
+    other = starts(pair(toys, *both), members=n, seed=5)
+    assert (other["ekf"] != whole["ekf"]).all()
+
+
+def test_a_part_of_a_design_has_the_rows_of_the_whole(toys):
+    """The count is that of the last member, unless it is said how many there are in all."""
+    design = Dispersion("a", ("ekf.start",), 1.0, "uniform", "latin_hypercube")
+    whole = starts(pair(toys, design), members=10)["ekf"]
+    for members in ([9, 2], [9, 6, 0]):
+        assert (
+            starts(pair(toys, design), members=members)["ekf"].tolist() == whole[members].tolist()
+        )
+    part = starts(pair(toys, design), members=[3, 1], runs=10)["ekf"]
+    assert part.tolist() == whole[[3, 1]].tolist()
+    with pytest.raises(ConfigurationError, match="design of 10 runs, and has no member 10"):
+        starts(pair(toys, design), members=[10], runs=10)
+
+
+@pytest.mark.parametrize(
+    ("kind", "spread", "options", "text"),
+    [
+        ("normal", 0.0, {}, "is zero: it would not be applied"),
+        ("log_uniform", [0.5, 2.0], {}, "give one above 1"),
+        ("log_uniform", 1.0, {}, "give one above 1"),
+        ("truncated", 1.0, {"limit": 0.0}, "it is a positive number of sigma"),
+        ("multivariate", [[1.0, 0.5], [0.4, 1.0]], {}, "is not symmetric"),
+        ("multivariate", [[1.0, 2.0], [2.0, 1.0]], {}, "smallest eigenvalue is -1"),  # 1 - 2
+        ("multivariate", "[[1, 0], [0, 1]] m", {}, r"m is not \(m\)\^2"),
+        ("list", [], {}, "not a list of values"),
+    ],
+)
+def test_spreads_that_cannot_be_are_refused(toys, kind, spread, options, text):
+    with pytest.raises(SystemCheckError, match=text):
+        drawn(toys, spread, kind, **options)
+
+
+def test_a_value_that_a_list_overrides_is_found(toys):
+    listed = Dispersion("l", ("ekf.start",), [[1.0, 2.0]], "list")
+    with pytest.raises(SystemCheckError, match="from dispersion 'l', and is fed by 'd' too"):
+        starts(pair(toys, listed, Dispersion("d", ("ekf.start", "ukf.start"), 1.0)))
+    two = (Dispersion("c", ("ekf.start",), 3.0), Dispersion("d", ("ekf.start",), 4.0))
+    found = starts(pair(toys, *two), members=4000)["ekf"]
+    # independent draws add up to sqrt(9 + 16) = 5, within 4 standard errors
+    np.testing.assert_allclose(found.std(axis=0), 5.0, rtol=4 / np.sqrt(2 * 4000))
+
+
+def test_dispersed_values_at_a_bound_are_accepted_and_beyond_it_refused(toys):
+    class Bounded(toys.Walk):
+        start = type(toys.Walk.start)(1.0, shape=(2,), unit="m", minimum=0.0)
+
+    for values, refused in (([[0.0, 1.0]], False), ([[-1e-9, 1.0]], True)):
+        system = toys.wire({"w": Bounded()}, [], duration=1)
+        system.disperse(Dispersion("d", ("w.start",), values, "list"))
+        if refused:
+            with pytest.raises(ConfigurationError, match=r"'w\.start' after dispersion 'd'"):
+                simulate(system)
+        else:
+            assert simulate(system).status == "complete"

@@ -275,3 +275,30 @@ def test_a_graph_that_cannot_be_drawn_is_answered(toys, tmp_path):
         system.graph(tmp_path / "absent" / "a.svg")
     with pytest.raises(SystemCheckError):
         half_built().graph()
+
+
+def test_a_plan_tells_its_numbers(toys):
+    """A step of 1/4 s, the gcd of 1 s and a delay of 3/4 s; components are counted from one."""
+    system = toys.wire({"c": toys.Clock(), "s": toys.EndSpy()}, ["c.t -> s.u delay 3/4"])
+    plan = system.check()
+    told = plan.content()
+    assert (told["base_step_s"], told["base_step"]) == (0.25, "0.25 s")
+    assert told["connections"] == [{"source": "c.t", "target": "s.u", "delay_s": 0.75, "at": "end"}]
+    rows = [line.split() for line in repr(plan).splitlines()]
+    assert [row[:2] for row in rows if row and row[0].isdigit()] == [["1", "c"], ["2", "s"]]
+
+
+def test_one_is_singular_and_none_is_plural():
+    empty = System("e", duration="2")
+    assert "0 components, 0 connections\n2 s, 1 member, seed 0" in repr(empty)
+    empty.add(Source(level=1.0), "source")
+    assert "1 component, 0 connections" in repr(empty)
+
+
+def test_only_what_must_be_connected_is_missing(toys):
+    class Easy(toys.EndSpy):
+        v = Input(default=0.0)
+
+    shown = repr(toys.wire({"s": Easy()}, []))
+    assert shown.count("missing: ") == 1
+    assert "missing: a connection to 's.u'" in shown

@@ -3,6 +3,7 @@
 import re
 from itertools import pairwise
 
+from terrafix.cosim.declare.ports import Input
 from terrafix.cosim.system.graph import Diagram, _place, arrows
 from terrafix.cosim.system.order import stepping_order
 
@@ -32,6 +33,38 @@ def test_messages_are_dashed(toys):
     system = toys.wire({"a": toys.Sender(), "b": toys.Reader()}, ["a.note -> b.note"])
     text = Diagram(system).mermaid
     assert "-.->" in text
+
+
+def test_each_kind_of_port_has_its_line_from_source_to_reader(toys):
+    """Mermaid's thick line for shared values; a delay is no read at the start of the step."""
+    parts = {"s": toys.Source(), "v": toys.Viewer(), "c": toys.Clock(), "e": toys.EndSpy()}
+    system = toys.wire(parts, ["s.image -> v.image", "c.t -> e.u delay 1/2"])
+    lines = Diagram(system).mermaid.splitlines()
+    assert lines[0] == "flowchart LR"
+    boxes = {line.split('["<b>')[0].strip(): line.split("<b>")[1][0] for line in lines[1:5]}
+    assert sorted(boxes.values()) == ["c", "e", "s", "v"]
+    links = [re.fullmatch(r' +(c\d) (\S+)\|"(.*)"\| (c\d)', line).groups() for line in lines[5:]]
+    found = {(boxes[a], arrow, label, boxes[b]) for a, arrow, label, b in links}
+    assert found == {
+        ("s", "==>", "image", "v"),
+        ("c", "-->", "t → u (delay 0.5 s)", "e"),
+    }
+
+
+def test_layers_count_the_reads_within_a_tick(toys):
+    """a -> b -> c, and x, which c alone reads, stands next to it; what runs back counts nothing."""
+
+    class Two(toys.EndSpy):
+        v = Input(unit="s")
+
+    parts = {"a": toys.Clock(), "b": toys.EndSpy(), "c": Two(), "x": toys.Clock()}
+    parts["back"] = toys.StartSpy()
+    links = ["a.t -> b.u", "b.echo -> c.u", "x.t -> c.v", "c.echo -> back.u"]
+    flat = toys.wire(parts, links).flatten()
+    drawn = arrows(flat)
+    assert {a.source: a.back for a in drawn} == {"a": False, "b": False, "x": False, "c": True}
+    boxes, _ = _place(stepping_order(flat), drawn)
+    assert {p: boxes[p].layer for p in parts} == {"a": 0, "b": 1, "c": 2, "x": 1, "back": 0}
 
 
 def test_sources_stand_left_of_readers_and_nothing_overlaps(toys):

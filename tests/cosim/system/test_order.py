@@ -39,6 +39,20 @@ def test_the_order_does_not_depend_on_the_order_of_declaration(toys):
     assert len(orders) == len(views) == 1
 
 
+def test_a_start_read_steps_before_its_source_where_it_can_and_a_delay_prefers_nobody(toys):
+    """So that the source's memory is read in place; else the order is that of the names."""
+    for name, order in (("z", ["z", "m"]), ("a", ["a", "m"])):
+        system = toys.wire({"m": toys.Clock(), name: toys.StartSpy()}, [f"m.t -> {name}.u"])
+        assert check(system).order == order
+        keepers = toys.fly(system, 2).master.wiring.keepers
+        assert not [kept for kept in keepers if kept.startswith("copy:")]
+    for name, order in (("z", ["m", "z"]), ("a", ["a", "m"])):
+        links = [f"m.t -> {name}.u delay 2"]
+        assert check(toys.wire({"m": toys.Clock(), name: toys.EndSpy()}, links)).order == order
+    names = check(toys.wire({k: toys.Clock() for k in "cab"}, [])).order
+    assert names == ["a", "b", "c"]
+
+
 def test_start_reads_hold_what_was_published_a_step_ago(toys):
     """Jacobi: the source of the same rate, whether or not it has to step first."""
     for extra in ([], ["late.echo -> clock2.u"]):  # forces nothing / forces consumer after source
@@ -111,6 +125,8 @@ def held(t, dt, period, offset=0):
         ((2, 0), (2, 1)),
         ((6, 4), (2, 2)),
         ((3, 2), (4, 3)),
+        ((2, 0), (2, 4)),  # steps on the reader's grid, before the reader's first step
+        ((1, 0), (1, 3)),
     ],
 )
 def test_start_reads_of_any_source_see_the_beginning_of_the_step(toys, source, reader, name):

@@ -1,6 +1,7 @@
 """Systems: building, nesting, exposing, and every mistake reported at once."""
 
 import pickle
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -345,6 +346,23 @@ def test_an_unconnected_input_names_what_would_fit(toys):
         check(system)
 
 
+def test_a_connection_hands_nothing_on_from_the_future(toys):
+    system = toys.wire({"c": toys.Clock(), "s": toys.EndSpy()}, [])
+    for delay in (-1, "-1/1000"):
+        with pytest.raises(RateError, match=r"delay of 'c\.t -> s\.u' is negative"):
+            system.connect("c.t", "s.u", delay=delay)
+    system.connect("c.t", "s.u", delay="1/1000")
+    assert system.connections[0].delay == Fraction(1, 1000)
+
+
+def test_optional_inputs_and_those_with_a_default_need_no_connection(toys):
+    class Easy(toys.EndSpy):
+        u = Input(unit="s", default=1.0)
+        v = Input(optional=True)
+
+    assert check(toys.wire({"s": Easy()}, [])).order == ["s"]
+
+
 def test_an_empty_system_is_a_mistake():
     with pytest.raises(SystemCheckError, match="the system has no components"):
         check(System("nothing"))
@@ -444,3 +462,122 @@ def test_a_schedule_is_all_of_its_times(toys):
     flown[1].records.clear()
     other = configuration(check(flown[1]))
     assert other["components"]["a"] != identity["components"]["a"]
+
+
+# ---------------------------------------------------------------------- base steps and notes
+
+
+def test_the_base_step_divides_periods_offsets_delays_and_records(toys):
+    """gcd of 1, 3/10 and 1/4 s is 1/20 s; a record of 1/7 s makes it 1/140 s, not the grid."""
+    parts = {"a": toys.Clock(rate=Rate(1, offset="0.3")), "b": toys.EndSpy()}
+    system = toys.wire(parts, ["a.t -> b.u delay 1/4"])
+    plan = check(system)
+    assert (plan.base, plan.grid) == (Fraction(1, 20), Fraction(1, 20))
+    system.record("fine", ["a.t"], period="1/7")
+    plan = check(system)
+    assert (plan.base, plan.grid) == (Fraction(1, 140), Fraction(1, 20))
+
+
+def test_listed_times_may_be_a_base_step_apart_and_no_closer(toys):
+    """Beside a clock of 1 s: 0.5 s and 1.5 s are apart, 0.5 s and 1.4 s are not."""
+    for times, fine in ((["0.5", "1.5"], True), (["0.5", "1.4"], False)):
+        parts = {"a": toys.Clock(rate=Rate(times=times)), "b": toys.Clock()}
+        if fine:
+            check(toys.wire(parts, []))
+        else:
+            with pytest.raises(SystemCheckError, match=r"closer than the base step of 1 s"):
+                check(toys.wire(parts, []))
+
+
+def test_a_component_is_asked_whether_it_serves_the_duration(toys):
+    class Short(toys.Clock):
+        def validate_duration(self, duration):
+            if duration > 5.0:
+                raise ConfigurationError(f"ends before {duration:g} s")
+
+    system = toys.wire({"c": Short()}, [], duration=6)
+    for duration in (None, "5.5", "1 min"):
+        with pytest.raises(SystemCheckError, match=r"ends before (6|5\.5|60) s"):
+            system.check(duration)
+    system.check(5)
+    check(system)  # not said: not asked
+
+
+@pytest.mark.parametrize(
+    ("rate", "noted"),
+    [
+        (Rate("1"), False),
+        (Rate("3"), False),
+        (Rate("1", offset=2), False),
+        (Rate("0.5"), True),
+        (Rate("1", offset="0.5"), True),
+        (Rate("1.5"), True),
+    ],
+)
+def test_a_record_between_the_steps_of_its_source_is_noted(toys, rate, noted):
+    system = toys.wire({"c": toys.Clock()}, [])
+    system.record("r", ["c.t"], rate=rate)
+    assert any("the last value is held" in note for note in check(system).notes) == noted
+
+
+def test_equal_units_in_other_words_are_no_conversion(toys):
+    class Unit(toys.EndSpy):
+        u = Input(unit="second")
+
+    notes = check(toys.wire({"c": toys.Clock(), "s": Unit()}, ["c.t -> s.u"])).notes
+    assert not notes
+
+
+def test_what_would_fit_has_the_same_shape_unit_and_frame_and_is_not_its_own(toys):
+    class Source(Component):
+        default_rate = Rate("1")
+        good = Output((3,), unit="m", frame="e")
+        scaled = Output((3,), unit="km", frame="e")
+        turned = Output((3,), unit="m", frame="i")
+        short = Output((2,), unit="m", frame="e")
+
+        def _step_impl(self, t, dt):
+            pass
+
+    class Sink(Source):
+        u = Input((3,), unit="m", frame="e")
+
+    with pytest.raises(SystemCheckError) as caught:
+        check(toys.wire({"source": Source(), "sink": Sink()}, []))
+    (problem,) = caught.value.problems
+    assert str(problem).endswith("unit and frame: 'source.good'")
+
+
+def test_a_component_that_never_steps_needs_no_step():
+    class Map(Component):
+        default_rate = Rate(times=[0])
+        height = Output(unit="m")
+
+        def _initialize_impl(self):
+            self.height = 8.0
+
+    system = System("still", duration=1)
+    system.add(Map(), "map")
+    simulation = Simulation(system)
+    simulation.run_until(1)
+    assert system.nodes["map"].height.tolist() == [8.0]
+    assert simulation.master.component_steps == 0
+
+
+def test_delays_rates_and_dispersions_come_through_nesting_and_replacing(toys):
+    inner = toys.wire({"c": toys.Clock(), "s": toys.EndSpy()}, ["c.t -> s.u delay 2"])
+    inner.add(toys.Walk(), "w")
+    inner.record("own", ["s.echo"], period="0.5")
+    inner.disperse(Dispersion("d", ("w.start",), 1.0))
+    inner.replace("s", toys.EndSpy())
+    outer = System("outer")
+    outer.add(inner, "in")
+    flat = outer.flatten()
+    assert [(c.source, c.target, c.delay) for c in flat.connections] == [("in.c.t", "in.s.u", 2)]
+    assert [(r.name, r.ports, r.rate) for r in flat.records] == [
+        ("in_own", ("in.s.echo",), Rate("0.5"))
+    ]
+    assert [(d.name, d.targets) for d in flat.dispersions] == [("in.d", ("in.w.start",))]
+    outer.add(toys.EndSpy(), "out")
+    outer.connect("in.c.t", "out.u", delay=3)
+    assert outer.flatten().connections[1].delay == 3
