@@ -53,7 +53,8 @@ def estimate_fields(state: ErrorState) -> dict[str, Field]:
     P = Field(
         (state.size, state.size), "1", doc="covariance of the error, in units of its elements"
     )
-    return {block.name: value_field(block) for block in state} | {"P": P}
+    times = {f"t_{i}": Field((1,), "s", doc="of its clones") for i in state.instants}
+    return {block.name: value_field(block) for block in state} | times | {"P": P}
 
 
 def fix_fields(observation: Observation) -> dict[str, Field]:
@@ -121,6 +122,10 @@ class FilterPredict(SymbolicComponent):
                 "posterior": MessageInput(fields=fields, at="start", doc="corrected estimate"),
                 "prior": BundleOutput(fields, doc="estimate before any fix of this instant"),
             }
+            for instant in state.instants:
+                ports[instant] = MessageInput(
+                    fields={"index": Field((), "1")}, at="start", doc="makes its clones anew"
+                )
             if cls.told:
                 told = [block for block in state if block.name in cls.told]
                 size = sum(block.size for block in told)
@@ -134,7 +139,11 @@ class FilterPredict(SymbolicComponent):
 
     @property
     def _sigmas(self) -> dict[str, str]:
-        given = {b.name: f"{b.name}_sigma0" for b in self.error_state if b.name not in self.told}
+        given = {
+            b.name: f"{b.name}_sigma0"
+            for b in self.error_state
+            if b.name not in self.told and not b.clone_of
+        }
         return given | self.sigmas
 
     def build_model(self) -> Model:

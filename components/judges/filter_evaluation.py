@@ -46,7 +46,7 @@ class FilterEvaluation(Evaluation):
 
     def __init_subclass__(cls, **options: Any) -> None:
         if "error_state" in vars(cls):
-            state, ports = cls.error_state, dict[str, Any]()
+            state, ports = cls.error_state.present, dict[str, Any]()
             for block in state:
                 truth = value_field(block)
                 ports[block.name] = Input(
@@ -57,7 +57,8 @@ class FilterEvaluation(Evaluation):
                     ports[f"{block.name}_{kind}"] = Output(
                         (block.size,), unit=block.unit, frame=block.frame, labels=labels
                     )
-            ports["estimate"] = BundleInput(estimate_fields(state), doc="to be evaluated")
+            fields = estimate_fields(cls.error_state)
+            ports["estimate"] = BundleInput(fields, doc="to be evaluated")
             ports["covariance"] = Output((state.size, state.size), doc="predicted, in SI")
             if cls.observation is not None:
                 fields = innovation_fields(cls.observation)
@@ -83,31 +84,29 @@ class FilterEvaluation(Evaluation):
         self._evaluate()
 
     def _evaluate(self) -> None:
-        state, estimate = self.error_state, self.estimate
+        state, estimate = self.error_state.present, self.estimate
+        own = [k for b in state for k in _elements(self.error_state, b.name)]
+        P = estimate.P[:, own][:, :, own]
         names = [block.name for block in state]
         truth = [self.port_views[name] for name in names]
         error = self._difference(*(getattr(estimate, name) for name in names), *truth)
-        variance = np.diagonal(estimate.P, axis1=1, axis2=2)
+        variance = np.diagonal(P, axis1=1, axis2=2)
         sigma = np.sqrt(np.where(variance > 0.0, variance, np.nan))
         for name, place in state.places.items():
             self.port_views[f"{name}_error"][...] = error[:, place]
             self.port_views[f"{name}_sigma"][...] = sigma[:, place]
         kept = self._judged()
-        self.nees = normalized_square(error[:, kept], estimate.P[:, kept][:, :, kept])
-        self.covariance = estimate.P
+        self.nees = normalized_square(error[:, kept], P[:, kept][:, :, kept])
+        self.covariance = P
         if self.observation is None:
             self.nis = self.nis_dof = self.accepted = self.reason = np.nan
         else:
             self._judge_fix()
 
     def _judged(self) -> list[int]:
-        names = self.judged or tuple(block.name for block in self.error_state)
-        return [
-            k
-            for name, place in self.error_state.places.items()
-            if name in names
-            for k in range(place.start, place.stop)
-        ]
+        state = self.error_state.present
+        names = self.judged or tuple(block.name for block in state)
+        return [k for b in state if b.name in names for k in _elements(state, b.name)]
 
     def _judge_fix(self) -> None:
         told = self.innovation
@@ -124,10 +123,11 @@ class FilterEvaluation(Evaluation):
 
     def error_model(self) -> Model:
         """Errors of all quantities as a function of what the ports bring, for linearization."""
-        shapes = {block.name: (block.value_size, 1) for block in self.error_state}
+        state = self.error_state.present
+        shapes = {block.name: (block.value_size, 1) for block in state}
         inputs = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
         given = {f"estimate.{n}": ca.SX.sym(f"estimate_{n}", *s) for n, s in shapes.items()}
-        error = _errors(self.error_state)(*given.values(), *inputs.values())
+        error = _errors(state)(*given.values(), *inputs.values())
         return Model("filter_error", inputs={**inputs, **given}, outputs={"error": error})
 
     def summarize(self, times: FloatArray, history: History) -> dict[str, Any]:
@@ -153,6 +153,12 @@ class FilterEvaluation(Evaluation):
             )
         ]
         return summary
+
+
+def _elements(state: ErrorState, name: str) -> range:
+    """Where a block's error lies."""
+    place = state.places[name]
+    return range(place.start, place.stop)
 
 
 def _errors(state: ErrorState) -> Any:

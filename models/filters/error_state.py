@@ -73,6 +73,8 @@ class Block:
         It counts in every covariance, and is never corrected.
     clone_of : str
         The block of which it is a copy at an earlier instant.
+    instant : str
+        Name of that instant; clones of one instant share it.
     """
 
     name: str
@@ -83,6 +85,7 @@ class Block:
     side: str = ""
     considered: bool = False
     clone_of: str = ""
+    instant: str = ""
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -166,9 +169,12 @@ def considered(block: Block) -> Block:
     return replace(block, considered=True)
 
 
-def clone(block: Block, name: str) -> Block:
-    """A copy of a block at an instant, under a name of its own; it stays as it was then."""
-    return replace(block, name=name, clone_of=block.name)
+def clone(block: Block, instant: str) -> Block:
+    """A copy of a block at an instant, ``NAME_at_INSTANT``; it stays as it was then.
+
+    A message named as the instant makes it, anew each time.
+    """
+    return replace(block, name=f"{block.name}_at_{instant}", clone_of=block.name, instant=instant)
 
 
 class _Values(dict[str, Any]):
@@ -199,6 +205,7 @@ class ErrorState:
         names = [block.name for block in blocks]
         if not names:
             raise ValueError("an error state has one block or more")
+        names += [f"t_{instant}" for instant in self.instants]
         twice = sorted({name for name in names if names.count(name) > 1} | {"P", "t"} & set(names))
         if twice:
             raise ValueError(
@@ -210,7 +217,7 @@ class ErrorState:
             if block.clone_of and (of is None or of.value_size != block.value_size):
                 raise ValueError(
                     f"'{block.name}' is a clone of '{block.clone_of}', which is no block like it; "
-                    f"the blocks are {', '.join(names)}"
+                    f"the blocks are {', '.join(b.name for b in blocks)}"
                 )
 
     def __iter__(self) -> Iterator[Block]:
@@ -231,6 +238,16 @@ class ErrorState:
         return found
 
     @property
+    def present(self) -> ErrorState:
+        """The blocks that are of now: without clones."""
+        return ErrorState(*(block for block in self.blocks if not block.clone_of))
+
+    @property
+    def instants(self) -> tuple[str, ...]:
+        """Names of the instants that clones are of."""
+        return tuple(dict.fromkeys(b.instant for b in self.blocks if b.clone_of))
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """Names of all elements of the error: ``"r_e x"``."""
         return tuple(f"{b.name} {axis}".rstrip() for b in self.blocks for axis in b.axes)
@@ -242,9 +259,10 @@ class ErrorState:
 
     @property
     def shapes(self) -> dict[str, tuple[int, int]]:
-        """Shapes of the fields of an estimate: values, and the covariance P."""
+        """Shapes of the fields of an estimate: values, the times of clones, the covariance P."""
         values = {block.name: (block.value_size, 1) for block in self.blocks}
-        return values | {"P": (self.size, self.size)}
+        times = {f"t_{instant}": (1, 1) for instant in self.instants}
+        return values | times | {"P": (self.size, self.size)}
 
     def symbols(self, name: str) -> dict[str, Any]:
         """Symbols of an estimate by field, named for `name`."""
@@ -299,6 +317,21 @@ class ErrorState:
             return P
         J = self.recentering(correction)
         return mirrored(ca.mtimes(J, ca.mtimes(P, J.T)))
+
+    def cloned(self, values: Values, instant: str, time: Any) -> dict[str, Any]:
+        """An estimate (values, ``P``) whose clones of an instant are those of now."""
+        made = dict(values)
+        J = ca.SX.eye(self.size)
+        for block in self.blocks:
+            if block.instant == instant:
+                own, of = self.places[block.name], self.places[block.clone_of]
+                made[block.name] = values[block.clone_of]
+                J[own, :] = 0
+                for k in range(block.size):
+                    J[own.start + k, of.start + k] = 1
+        made["P"] = mirrored(ca.mtimes(J, ca.mtimes(mirrored(values["P"]), J.T)))
+        made[f"t_{instant}"] = time
+        return made
 
     @property
     def kept(self) -> tuple[int, ...]:

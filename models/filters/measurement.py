@@ -53,6 +53,8 @@ class Observation:
         Labels of elements that are angles, in radians: their differences are within half a turn.
     inputs, parameters : mapping of str to int
         Sizes of what else it reads.
+    instant : str
+        Of the clones that it is a measurement of; empty: of now.
 
     Raises
     ------
@@ -67,6 +69,7 @@ class Observation:
     angles: Sequence[str] = ()
     inputs: Mapping[str, int] = field(default_factory=dict)
     parameters: Mapping[str, int] = field(default_factory=dict)
+    instant: str = ""
 
     def __post_init__(self) -> None:
         names = [block.name for block in self.fields]
@@ -121,8 +124,13 @@ class Observation:
         Raises
         ------
         ValueError
-            If what is predicted has another size.
+            If what is predicted has another size, or is of an instant without a clone.
         """
+        if self.instant and self.instant not in state.instants:
+            raise ValueError(
+                f"an observation is of the instant '{self.instant}', of which there is no clone; "
+                f"the instants are {', '.join(state.instants) or 'none'}"
+            )
         error = ca.SX.sym("error", state.size)
         told = {block.name: message[block.name] for block in self.fields}
         uncertain = {name: ca.SX.sym(name, *told[name].shape) for name in self.mapped}
@@ -242,5 +250,5 @@ def corrected(
     accepted = reason == 0
     P = state.recentered(outcome.P, outcome.correction) if recentered else outcome.P
     posterior = {**state.normalized(state.retract(prior, outcome.correction)), "P": P}
-    values = {k: ca.if_else(accepted, posterior[k], prior[k]) for k in posterior}
+    values = {**prior, **{k: ca.if_else(accepted, posterior[k], prior[k]) for k in posterior}}
     return Correction(values, accepted, reason, dof, outcome)

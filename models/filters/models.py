@@ -20,6 +20,9 @@ from terrafix.models.filters.measurement import Observation, corrected
 from terrafix.models.filters.process import Process, propagate
 from terrafix.models.filters.updates import Measurement, update_rule
 
+NEVER = -1e12
+"""Time of a clone that was not made yet [s]."""
+
 
 def predict_model(
     name: str,
@@ -47,7 +50,8 @@ def predict_model(
     -------
     Model
         Inputs of the process; ``posterior.*`` and the flag ``posterior.fresh``, which makes the
-        step begin there; for the start alone ``start.*`` of the blocks told, and ``start.P``.
+        step begin there; ``INSTANT.fresh``, which makes its clones anew at the start of the step;
+        for the start alone ``start.*`` of the blocks told, and ``start.P``.
         Outputs ``prior.*``.
 
     Raises
@@ -62,7 +66,7 @@ def predict_model(
                 f"filter '{name}' starts '{block}', which is no block; the blocks are "
                 f"{', '.join(names)}"
             )
-    for block in names:
+    for block in (block.name for block in state if not block.clone_of):
         if (block in told) == (block in sigmas):
             raise ValueError(
                 f"block '{block}' of filter '{name}' starts from a message or from a sigma: "
@@ -73,24 +77,28 @@ def predict_model(
     own, posterior = state.symbols("own"), state.symbols("posterior")
     fresh, step, time = (ca.SX.sym(key) for key in ("posterior_fresh", "dt", "time"))
     begin = {key: ca.if_else(fresh > 0.5, posterior[key], own[key]) for key in own}
+    marks = {instant: ca.SX.sym(f"{instant}_fresh") for instant in state.instants}
+    for instant, mark in marks.items():
+        made = state.cloned(begin, instant, time - step)
+        begin = {key: ca.if_else(mark > 0.5, made[key], begin[key]) for key in begin}
     moved = propagate(state, process, begin, {**inputs, **parameters}, step, time)
     sigma = {key: ca.SX.sym(key) for key in sigmas.values()}
     start, initial = _start(state, told, {block: sigma[key] for block, key in sigmas.items()})
-    uses_time = time.element_hash() in {
-        e.element_hash()
-        for e in ca.symvar(ca.vertcat(*(ca.vec(ca.SX(v)) for v in moved.values.values())))
-    }
+    following = {**begin, **moved.values, "P": moved.covariance(begin["P"])}
+    free = ca.symvar(ca.vertcat(*(ca.vec(ca.SX(value)) for value in following.values())))
+    uses_time = time.element_hash() in {element.element_hash() for element in free}
     return Model(
         name,
         inputs={
             **inputs,
             **{f"posterior.{key}": symbol for key, symbol in posterior.items()},
             "posterior.fresh": fresh,
+            **{f"{instant}.fresh": mark for instant, mark in marks.items()},
             **start,
         },
         states=own,
         parameters={**parameters, **sigma},
-        next={**moved.values, "P": moved.covariance(begin["P"])},
+        next=following,
         initial=initial,
         outputs={f"prior.{key}": symbol for key, symbol in own.items()},
         step=step,
@@ -121,7 +129,11 @@ def _start(
         for k in range(state.places[name].start, state.places[name].stop):
             P[k, k] = sigma**2
     initial = {b.name: start.get(f"start.{b.name}", b.start()) for b in state}
-    return start, {**initial, "P": ca.densify(P)}
+    for block in state:
+        if block.clone_of:
+            initial[block.name] = initial[block.clone_of]
+    never = {f"t_{instant}": ca.SX(NEVER) for instant in state.instants}
+    return start, {**initial, **never, "P": ca.densify(P)}
 
 
 def correct_model(
@@ -202,7 +214,7 @@ def correct_model(
         rule,
         gate=gate,
         beta=beta,
-        lateness=fix_t - time,
+        lateness=fix_t - (prior[f"t_{observation.instant}"] if observation.instant else time),
         recentered=recentered,
     )
     accepted = ca.logic_and(arrived, outcome.accepted)

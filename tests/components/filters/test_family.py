@@ -11,7 +11,7 @@ from terrafix.components.noisy import NoisyComponent
 from terrafix.cosim.campaign.campaign import run_campaign
 from terrafix.cosim.lincov.deviations import linear_covariance
 from terrafix.models.core.model import Model
-from terrafix.models.filters.error_state import ErrorState, vector
+from terrafix.models.filters.error_state import ErrorState, clone, vector
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.process import Process
 
@@ -217,3 +217,111 @@ def test_a_parameter_that_the_process_names_must_be_declared():
 
     with pytest.raises(tf.SystemCheckError, match="parameter 'accel_psd' that Forgetful does"):
         tracker(predict=Forgetful()).check()
+
+
+# ------------------------------------------------------------------------- late measurements
+
+LATE_STATE = ErrorState(*STATE, clone(STATE.blocks[0], "center"))
+LATE_RANGE = Observation(lambda x, _: x["r_at_center"], {"range": "m"}, instant="center")
+
+
+class Mark(tf.Component):
+    """Says when an aperture has its center."""
+
+    default_rate = tf.Rate("1", offset="0.5")
+    center = tf.MessageOutput(fields={"index": tf.Field(())})
+
+    def _step_impl(self, t, dt):
+        self.center.publish(t, index=0.0)
+
+
+class LatePredict(TrackerPredict):
+    """With a copy of the position at the center."""
+
+    error_state, process = LATE_STATE, PROCESS
+
+
+class LateCorrect(FilterCorrect):
+    """Corrects by a range that was measured half a second ago."""
+
+    default_rate = tf.Rate("1", offset="1")
+    error_state, observation = LATE_STATE, LATE_RANGE
+
+
+class LateEvaluation(FilterEvaluation):
+    """Of what is known now."""
+
+    default_rate = tf.Rate("1")
+    error_state, observation = LATE_STATE, LATE_RANGE
+
+
+class Held(tf.Component):
+    """Hands a message on half a second later, with the time it was measured at."""
+
+    default_rate = tf.Rate("1", offset="1")
+    fix = tf.MessageInput(fields=RangeSensor.declarations["fix"].fields)
+    late = tf.MessageOutput(fields=RangeSensor.declarations["fix"].fields)
+    shift = tf.Parameter(0.0, unit="s")
+
+    def _step_impl(self, t, dt):
+        fix = self.fix
+        self.late.publish(
+            fix.t + self.shift, valid=fix.fresh, y=fix.y, R=fix.R, present=fix.present
+        )
+
+
+def late(*, waits, shift="0 s"):
+    """Ranges of half a second ago: by a clone, or with a filter that has them at once."""
+    with tf.System("late", duration="30", seed=5) as system:
+        truth = system.add(Truth(), "truth")
+        ranger = system.add(RangeSensor(rate=tf.Rate("1", offset="0.5")), "ranger")
+        system.connect(truth["r"], ranger["x"])
+        if waits:
+            predict = system.add(LatePredict(), "predict")
+            correct = system.add(LateCorrect(), "correct")
+            judge = system.add(LateEvaluation(), "judge")
+            held, mark = system.add(Held(shift=shift), "held"), system.add(Mark(), "mark")
+            system.connect(ranger["fix"], held["fix"])
+            system.connect(held["late"], correct["fix"])
+            system.connect(mark["center"], predict["center"])
+        else:
+            predict = system.add(TrackerPredict(), "predict")
+            correct = system.add(RangeCorrect(rate=tf.Rate("0.5", offset="0.5")), "correct")
+            judge = system.add(TrackerEvaluation(), "judge")
+            system.connect(ranger["fix"], correct["fix"])
+        system.connect(predict["prior"], correct["prior"])
+        system.connect(correct["posterior"], predict["posterior"])
+        system.connect(correct["estimate"], judge["estimate"])
+        system.connect(correct["innovation"], judge["innovation"])
+        for name in ("r", "v"):
+            system.connect(truth[name], judge[name])
+    return system
+
+
+def test_a_clone_equals_the_filter_that_had_the_measurement_in_time():
+    """The same draws: the same errors and covariance once both have it."""
+    cloned, timely = (tf.simulate(late(waits=w), members=5).dataset for w in (True, False))
+    for name in ("r_error", "v_error", "covariance"):
+        a, b = (
+            d[f"judge.{name}"].sel(**{d[f"judge.{name}"].dims[0]: slice(1, None)}).values
+            for d in (cloned, timely)
+        )
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_a_late_measurement_of_another_instant_is_not_taken():
+    result = tf.simulate(late(waits=True, shift="0.1 s"))
+    assert {fix["reason"] for fix in result.evaluation["fixes"]} == {"not of this instant"}
+
+
+class Hopeful(FilterCorrect):
+    """Corrects by what was measured at an instant that its state has no clone of."""
+
+    default_rate = tf.Rate("1", offset="1")
+    error_state, observation = STATE, LATE_RANGE
+
+
+def test_a_late_measurement_without_a_clone_is_refused():
+    hopeful = Hopeful()
+    with pytest.raises(ValueError, match=r"'center', of which there is no clone; .* none"):
+        hopeful.build_model()

@@ -113,7 +113,7 @@ def test_a_covariance_follows_the_corrected_estimate(side):
         (lambda: vector("a", 2, labels=("x",)), "1 labels for 2 elements"),
         (
             lambda: ErrorState(vector("a"), clone(vector("b"), "c")),
-            "'c' is a clone of 'b', which is no block like it; the blocks are a, c",
+            "'b_at_c' is a clone of 'b', which is no block like it; the blocks are a, b_at_c",
         ),
         (lambda: ErrorState(vector("a", 2), Block("c", 3, clone_of="a")), "a clone of 'a'"),
     ],
