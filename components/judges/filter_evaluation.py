@@ -38,6 +38,8 @@ class FilterEvaluation(Evaluation):
     observation: ClassVar[Observation | None] = None
     judged: ClassVar[tuple[str, ...]] = ()
 
+    estimate: Any
+    innovation: Any
     nees = Output(doc="normalized estimation error squared")
     nis = Output(doc="normalized innovation squared of this instant's fix, if accepted")
     nis_dof = Output(doc="elements in that fix")
