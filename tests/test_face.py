@@ -27,7 +27,7 @@ FACE = [
         "SystemCheckError",
     ),
     *("Table", "TerrafixError", "Text", "WindowInput", "WiringError", "__version__"),
-    *("check_fmu", "components", "export_fmu", "linear_covariance", "read_result"),
+    *("check_fmu", "components", "export_fmu", "filters", "linear_covariance", "read_result"),
     *("read_system", "run_campaign", "simulate", "testing", "write_system"),
 ]
 

@@ -20,7 +20,7 @@ def blocks(page: Path) -> list[str]:
 @EVERY_PAGE
 def test_names_of_the_face_are_there_and_imports_are_few(page):
     for block in blocks(page):
-        for name in re.findall(r"\btf\.((?:components\.|testing\.)?\w+)", block):
+        for name in re.findall(r"\btf\.((?:components\.|filters\.|testing\.)?\w+)", block):
             owner, _, last = name.rpartition(".")
             assert hasattr(getattr(tf, owner) if owner else tf, last), name
         imports = re.findall(r"^\s*(?:import|from) .*", block, re.MULTILINE)

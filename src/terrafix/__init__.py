@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from terrafix import components as components
+    from terrafix import filters as filters
     from terrafix import testing as testing
     from terrafix.cosim.basics.clock import Rate as Rate
     from terrafix.cosim.basics.errors import CheckpointError as CheckpointError
@@ -122,7 +123,7 @@ _FROM = {
     "SystemCheckError": "cosim.basics.errors",
 }
 """Where each name comes from."""
-_MODULES = ("components", "testing")
+_MODULES = ("components", "filters", "testing")
 
 __all__ = sorted([*_FROM, *_MODULES, "__version__"])
 
