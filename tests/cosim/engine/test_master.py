@@ -1,15 +1,11 @@
 """The master: failures, masks, determinism, members alone and together, and what it costs."""
 
-import time
-
 import numpy as np
 import pytest
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, RateError, StepError
 from terrafix.cosim.basics.noise import NormalStream
-from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.ports import Input, Output
 from terrafix.cosim.engine.run import RunError, simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.dispersion import Dispersion
@@ -353,39 +349,3 @@ def test_members_that_do_not_fit_into_memory_are_refused(toys, monkeypatch):
     assert len(Simulation(system, members=409).members) == 409
     with pytest.raises(ConfigurationError, match="410 members need more than 0 GiB"):
         Simulation(system, members=410)
-
-
-class Idle(Component):
-    """Nothing but three ports of width 3."""
-
-    default_rate = Rate(hz=100)
-    a = Input((3,), default=0.0)
-    b = Input((3,), at="start")
-    y = Output((3,))
-
-    def _initialize_impl(self):
-        self.y = 0.0
-
-    def _step_impl(self, t, dt):
-        pass
-
-
-def test_a_step_costs_little():
-    """The promise is 3 microseconds per component step; the bound allows for a busy machine."""
-    n, ticks = 10, 2000
-    with System("idle") as system:
-        for k in range(n):
-            system.add(Idle(), f"c{k}")
-        for k in range(n):
-            if k:
-                system.connect(f"c{k - 1}.y", f"c{k}.a")
-            system.connect(f"c{(k + 1) % n}.y", f"c{k}.b")
-    simulation = Simulation(system)
-    simulation.initialize()
-    best = np.inf
-    for k in range(1, 6):
-        started = time.process_time()
-        simulation.master.run_until(k * ticks)
-        best = min(best, (time.process_time() - started) / (ticks * n))
-    print(f"\n{best * 1e6:.2f} microseconds per component step")
-    assert best < 10e-6
