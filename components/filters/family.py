@@ -62,9 +62,14 @@ def fix_fields(observation: Observation) -> dict[str, Field]:
     labels = tuple(observation.elements)
     found = {"y": Field((observation.size,), _units(observation), labels=labels, doc="measured")}
     found |= {block.name: value_field(block) for block in observation.fields}
-    for name, shape in observation.shapes().items():
-        if name not in (*found, "present"):
-            found[name] = Field(shape, "1", doc="a covariance")
+    m, told = observation.size, {block.name: block for block in observation.fields}
+    found["R"] = Field((m, m), "1", doc="covariance of the noise of y, in its units")
+    for name, covariance in observation.mapped.items():
+        block = told[name]
+        unit = "1" if block.unit == "1" else f"{block.unit}^2"
+        found[covariance] = Field(
+            (block.size, block.size), unit, block.frame, doc=f"covariance of the error of {name}"
+        )
     doc = "1 where an element was measured, else 0"
     return found | {"present": Field((observation.size,), "1", labels=labels, doc=doc)}
 
@@ -88,7 +93,7 @@ def innovation_fields(observation: Observation) -> dict[str, Field]:
     }
 
 
-def _declare(cls: type, **ports: Any) -> None:
+def declare(cls: type, **ports: Any) -> None:
     """Declare on a class what it does not declare itself."""
     for name, port in ports.items():
         if name not in vars(cls):
@@ -134,7 +139,7 @@ class FilterPredict(SymbolicComponent):
                 ports["start"] = MessageInput(
                     fields=start, needed_at_start=True, doc="last known state, at t = 0"
                 )
-            _declare(cls, **ports)
+            declare(cls, **ports)
         super().__init_subclass__(**options)
 
     @property
@@ -176,7 +181,7 @@ class FilterCorrect(SymbolicComponent):
     def __init_subclass__(cls, **options: Any) -> None:
         if "error_state" in vars(cls):
             fields, m = estimate_fields(cls.error_state), cls.observation.size
-            _declare(
+            declare(
                 cls,
                 gate=Parameter(
                     np.inf,

@@ -8,7 +8,12 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from terrafix.components.filters.family import estimate_fields, innovation_fields, value_field
+from terrafix.components.filters.family import (
+    declare,
+    estimate_fields,
+    innovation_fields,
+    value_field,
+)
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.declare.evaluation import Evaluation, History, Quantity, consistency
 from terrafix.cosim.declare.ports import BundleInput, Input, MessageInput, Output
@@ -23,61 +28,76 @@ class FilterEvaluation(Evaluation):
     """Errors (estimate minus truth) of every block, and what became of each fix: base.
 
     Its ports follow from the error state: an input for the truth of each block, under the block's
-    name; the estimate; outputs ``NAME_error`` and ``NAME_sigma``.
+    name; the estimate; outputs ``NAME_error`` and ``NAME_sigma``. Of one measurement it reads
+    ``innovation``; of several, ``NAME_innovation`` each, and publishes ``NAME_nis``, ``_nis_dof``,
+    ``_accepted`` and ``_reason`` of each beside those of all. Corrections of one instant are made
+    one after the other, so that their innovations are independent and their NIS add up.
 
     Attributes
     ----------
     error_state : ErrorState
     observation : Observation, optional
-        Of the correction whose innovations are judged; of a chain, its last.
+        Of the one correction whose innovations are judged.
+    observations : dict of str to Observation
+        Of several, by the names of the measurements, in the order of the chain.
     judged : tuple of str
         Blocks that NEES is taken over; all, if empty.
+    called : dict of str to str
+        Blocks whose errors go by another name.
     """
 
     error_state: ClassVar[ErrorState]
     observation: ClassVar[Observation | None] = None
+    observations: ClassVar[dict[str, Observation]] = {}
     judged: ClassVar[tuple[str, ...]] = ()
+    called: ClassVar[dict[str, str]] = {}
 
     estimate: Any
-    innovation: Any
     nees = Output(doc="normalized estimation error squared")
-    nis = Output(doc="normalized innovation squared of this instant's fix, if accepted")
-    nis_dof = Output(doc="elements in that fix")
-    accepted = Output(doc="1 if that fix was accepted, 0 if not")
-    reason = Output(doc="index into terrafix.models.filters.measurement.REASONS")
+    nis = Output(doc="normalized innovation squared of this instant's accepted fixes")
+    nis_dof = Output(doc="elements in those fixes")
+    accepted = Output(doc="part of this instant's fixes that was accepted")
+    reason = Output(doc="index into terrafix.models.filters.measurement.REASONS, of the last")
 
     def __init_subclass__(cls, **options: Any) -> None:
         if "error_state" in vars(cls):
             state, ports = cls.error_state.present, dict[str, Any]()
+            _check(cls)
             for block in state:
-                truth = value_field(block)
+                truth, name = value_field(block), cls.called.get(block.name, block.name)
                 ports[block.name] = Input(
                     truth.fixed_shape, unit=truth.unit, frame=truth.frame, doc="truth"
                 )
                 labels = block.axes if block.size > 1 else ()
                 for kind in ("error", "sigma"):
-                    ports[f"{block.name}_{kind}"] = Output(
+                    ports[f"{name}_{kind}"] = Output(
                         (block.size,), unit=block.unit, frame=block.frame, labels=labels
                     )
             fields = estimate_fields(cls.error_state)
             ports["estimate"] = BundleInput(fields, doc="to be evaluated")
-            ports["covariance"] = Output((state.size, state.size), doc="predicted, in SI")
-            if cls.observation is not None:
-                fields = innovation_fields(cls.observation)
-                ports["innovation"] = MessageInput(fields=fields, optional=True, doc="of the fixes")
-                ports["normalized_innovation"] = Output(
-                    (cls.observation.size,), doc="of an accepted fix, over its sigma"
-                )
-            for name, port in ports.items():
-                if name not in vars(cls):
-                    setattr(cls, name, port)
-                    port.__set_name__(cls, name)
-            cls.quantities = tuple(Quantity(b.name, b.unit, b.axes) for b in state)
+            ports["covariance"] = Output(
+                (state.size, state.size),
+                doc=f"predicted, in SI: {', '.join(dict.fromkeys(state.units))}",
+            )
+            ports |= _of_fixes(cls)
+            declare(cls, **ports)
+            cls.quantities = tuple(
+                Quantity(cls.called.get(b.name, b.name), b.unit, b.axes) for b in state
+            )
+            cls.nees_axes = len(cls._judged())
+            cls.measurements = tuple(cls.observations)
             shapes = [(b.value_size,) for b in state]
             cls._difference = staticmethod(over_members(_errors(state), *shapes, *shapes))
         super().__init_subclass__(**options)
 
     _difference: ClassVar[Any]
+
+    @classmethod
+    def _measured(cls) -> dict[str, Observation]:
+        """Observations by the prefix of their ports."""
+        if cls.observation is not None:
+            return {"": cls.observation}
+        return {f"{name}_": seen for name, seen in cls.observations.items()}
 
     def _initialize_impl(self) -> None:
         self._evaluate()
@@ -94,34 +114,51 @@ class FilterEvaluation(Evaluation):
         error = self._difference(*(getattr(estimate, name) for name in names), *truth)
         variance = np.diagonal(P, axis1=1, axis2=2)
         sigma = np.sqrt(np.where(variance > 0.0, variance, np.nan))
-        for name, place in state.places.items():
+        for block, place in state.places.items():
+            name = self.called.get(block, block)
             self.port_views[f"{name}_error"][...] = error[:, place]
             self.port_views[f"{name}_sigma"][...] = sigma[:, place]
         kept = self._judged()
         self.nees = normalized_square(error[:, kept], P[:, kept][:, :, kept])
         self.covariance = P
-        if self.observation is None:
-            self.nis = self.nis_dof = self.accepted = self.reason = np.nan
-        else:
-            self._judge_fix()
+        self._judge_fixes()
 
-    def _judged(self) -> list[int]:
-        state = self.error_state.present
-        names = self.judged or tuple(block.name for block in state)
+    @classmethod
+    def _judged(cls) -> list[int]:
+        state = cls.error_state.present
+        names = cls.judged or tuple(block.name for block in state)
         return [k for b in state if b.name in names for k in _elements(state, b.name)]
 
-    def _judge_fix(self) -> None:
-        told = self.innovation
-        # a fix that was refused says why in `reason`, and nothing of the filter's consistency
-        used = told.fresh & (told.accepted > 0.5)
-        measured = used[:, None] & ((told.residual != 0.0) | (told.sigma != 1.0))
-        self.normalized_innovation = np.where(
-            measured, told.residual / np.where(measured, told.sigma, 1.0), np.nan
-        )
-        self.nis = np.where(used, told.nis, np.nan)
-        self.nis_dof = np.where(used, told.dof, np.nan)
-        self.accepted = np.where(told.fresh, told.accepted, np.nan)
-        self.reason = np.where(told.fresh, told.reason, np.nan)
+    def _judge_fixes(self) -> None:
+        n = self.n_members
+        nis, dof, good, come = (np.zeros(n) for _ in range(4))
+        reason = np.full(n, np.nan)
+        at = 0
+        for prefix, seen in self._measured().items():
+            told = self.port_views[f"{prefix}innovation"]
+            # a fix that was refused says why in `reason`, and nothing of the filter's consistency
+            used = told.fresh & (told.accepted > 0.5)
+            measured = used[:, None] & ((told.residual != 0.0) | (told.sigma != 1.0))
+            self.port_views["normalized_innovation"][:, at : at + seen.size] = np.where(
+                measured, told.residual / np.where(measured, told.sigma, 1.0), np.nan
+            )
+            at += seen.size
+            nis += np.where(used, told.nis, 0.0)
+            dof += np.where(used, told.dof, 0.0)
+            good, come = good + used, come + told.fresh
+            reason = np.where(told.fresh, told.reason, reason)
+            if prefix:
+                for name, values, given in (
+                    ("nis", told.nis, used),
+                    ("nis_dof", told.dof, used),
+                    ("accepted", told.accepted, told.fresh),
+                    ("reason", told.reason, told.fresh),
+                ):
+                    self.port_views[f"{prefix}{name}"][...] = np.where(given, values, np.nan)
+        self.nis = np.where(good > 0, nis, np.nan)
+        self.nis_dof = np.where(good > 0, dof, np.nan)
+        self.accepted = np.where(come > 0, good / np.maximum(come, 1), np.nan)
+        self.reason = reason
 
     def error_model(self) -> Model:
         """Errors of all quantities as a function of what the ports bring, for linearization."""
@@ -135,26 +172,70 @@ class FilterEvaluation(Evaluation):
     def summarize(self, times: FloatArray, history: History) -> dict[str, Any]:
         """Summarize errors at the end, NEES and NIS over all fixes, and the fixes one by one."""
         summary = super().summarize(times, history)
-        epochs = np.isfinite(history["accepted"]).any(axis=1)
-        if not epochs.any():
+        measured = self._measured()
+        if not measured:
             return summary
+        epochs = np.isfinite(history["accepted"]).any(axis=1)
         given = np.isfinite(history["accepted"][epochs])
         nees = np.where(given, history["nees"][epochs], np.nan)
-        dof = history["nis_dof"][epochs]
         summary["nees"] = consistency(nees, float(len(self._judged())), independent_epochs=False)
-        expected = float(np.nanmean(dof)) if np.isfinite(dof).any() else 1.0
-        summary["nis"] = consistency(history["nis"][epochs], expected, independent_epochs=True)
+        for prefix in ("", *(p for p in measured if p)):
+            size = (
+                sum(seen.size for seen in measured.values())
+                if not prefix
+                else measured[prefix].size
+            )
+            dof = history[f"{prefix}nis_dof"][epochs]
+            mean = float(np.nanmean(dof)) if np.isfinite(dof).any() else float(size)
+            values = history[f"{prefix}nis"][epochs]
+            summary[f"{prefix}nis"] = consistency(values, mean, independent_epochs=True)
         summary["fixes"] = [
-            _fix(t, accepted[valid], reason[valid])
-            for t, accepted, reason, valid in zip(
-                times[epochs],
-                history["accepted"][epochs],
-                history["reason"][epochs],
-                given,
-                strict=True,
+            {**fix, **({"of": prefix.rstrip("_")} if prefix else {})}
+            for k in np.flatnonzero(epochs)
+            for prefix in measured
+            for fix in _fixes(
+                times[k], *(history[f"{prefix}{n}"][k] for n in ("accepted", "reason"))
             )
         ]
         return summary
+
+
+def _check(cls: type[FilterEvaluation]) -> None:
+    """Raise ValueError if names of a subclass do not fit its error state."""
+    names = [block.name for block in cls.error_state.present]
+    for kind, given in (("judged", cls.judged), ("called", cls.called)):
+        for name in given:
+            if name not in names:
+                raise ValueError(
+                    f"{cls.__name__}.{kind} names '{name}', which is no block of its error state; "
+                    f"the blocks are {', '.join(names)}"
+                )
+    if cls.observation is not None and cls.observations:
+        raise ValueError(
+            f"{cls.__name__} has one observation or several observations by name, not both"
+        )
+
+
+def _of_fixes(cls: type[FilterEvaluation]) -> dict[str, Any]:
+    """Ports about the fixes."""
+    ports: dict[str, Any] = {}
+    measured = cls._measured()
+    for prefix, seen in measured.items():
+        ports[f"{prefix}innovation"] = MessageInput(
+            fields=innovation_fields(seen), optional=True, doc="of the fixes"
+        )
+        if prefix:
+            of = f"of {prefix.rstrip('_')}"
+            ports[f"{prefix}nis"] = Output(doc=f"normalized innovation squared {of}, if accepted")
+            ports[f"{prefix}nis_dof"] = Output(doc=f"elements in the fix {of}")
+            ports[f"{prefix}accepted"] = Output(doc=f"1 if the fix {of} was accepted, 0 if not")
+            ports[f"{prefix}reason"] = Output(doc=f"index into REASONS, {of}")
+    if measured:
+        ports["normalized_innovation"] = Output(
+            (sum(seen.size for seen in measured.values()),),
+            doc="of this instant's accepted fixes, over its sigma; NaN where not measured",
+        )
+    return ports
 
 
 def _elements(state: ErrorState, name: str) -> range:
@@ -175,11 +256,17 @@ def _errors(state: ErrorState) -> Any:
     return errors
 
 
-def _fix(t: float, accepted: FloatArray, reason: FloatArray) -> dict[str, Any]:
-    counts = Counter(REASONS[int(r)] for r in reason)
-    fraction = float(accepted.mean())
-    return {
-        "t_s": float(t),
-        "accepted": bool(fraction) if len(accepted) == 1 else fraction,
-        "reason": counts.most_common(1)[0][0] if len(counts) == 1 else dict(counts),
-    }
+def _fixes(t: float, accepted: FloatArray, reason: FloatArray) -> list[dict[str, Any]]:
+    """The fix of an instant, in a list; none, where no member had one."""
+    given = np.isfinite(accepted)
+    if not given.any():
+        return []
+    counts = Counter(REASONS[int(r)] for r in reason[given])
+    fraction = float(accepted[given].mean())
+    return [
+        {
+            "t_s": float(t),
+            "accepted": bool(fraction) if given.sum() == 1 else fraction,
+            "reason": counts.most_common(1)[0][0] if len(counts) == 1 else dict(counts),
+        }
+    ]

@@ -56,9 +56,20 @@ class Evaluation(Component):
     (n_axes,). What a campaign judges a filter by goes by these names, all optional: ``nees``;
     ``covariance``, of all axes of all quantities in their order; ``nis`` with ``nis_dof``, and
     ``normalized_innovation``, NaN where nothing was measured.
+
+    Attributes
+    ----------
+    quantities : tuple of Quantity
+    nees_axes : int, optional
+        Number of axes that ``nees`` is of, where it is not all of them.
+    measurements : tuple of str
+        Of several measurements, their names: ``NAME_nis`` and ``NAME_nis_dof`` are judged one by
+        one, too.
     """
 
     quantities: ClassVar[tuple[Quantity, ...]] = ()
+    nees_axes: ClassVar[int | None] = None
+    measurements: ClassVar[tuple[str, ...]] = ()
 
     def error_model(self) -> Any:
         """Errors of all quantities, in one output ``error``, as a function of the inputs' fields.

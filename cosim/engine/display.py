@@ -93,7 +93,9 @@ def _evaluation(path: str, summary: Mapping[str, Any], members: int) -> Iterator
             yield Text(_consistency_line(name, value))
     fixes = summary.get("fixes")
     if isinstance(fixes, Sequence) and fixes:
-        yield Text(_fixes_line(fixes))
+        for of in dict.fromkeys(fix.get("of") for fix in fixes):
+            said = _fixes_line([fix for fix in fixes if fix.get("of") == of])
+            yield Text(f"{of}: {said}" if of else said)
     for name, value in summary.items():
         if isinstance(value, int | float | str):
             yield Text(f"{name}  {value if isinstance(value, str) else number(value)}")
@@ -136,6 +138,8 @@ def _ratio(value: float | None, sigma: float | None) -> str:
 
 def _consistency_line(name: str, value: Mapping[str, Any]) -> str:
     label = name.upper() if name in ("nees", "nis") else name
+    if name.endswith("_nis"):
+        label = f"NIS of {name.removesuffix('_nis')}"
     interval = value["interval_95"]
     text = f"{label:<5} mean {number(value['mean'])} for {value['dof']:g} degrees of freedom"
     if interval:

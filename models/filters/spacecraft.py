@@ -38,12 +38,7 @@ from terrafix.models.filters.process import Process
 from terrafix.models.filters.updates import Measurement
 from terrafix.models.geometry.antenna import nominal_antenna
 from terrafix.models.geometry.frames import earth_rate_cross
-from terrafix.models.geometry.quaternion import (
-    inverse,
-    product,
-    rotation_matrix,
-    rotation_vector,
-)
+from terrafix.models.geometry.quaternion import rotation_matrix
 from terrafix.models.motion.gravity import gravity_acceleration
 from terrafix.models.sensors.sar import predicted_measurement
 
@@ -314,28 +309,11 @@ def sar_observation(in_track: str = "speed") -> Observation:
     )
 
 
-def navigation_error(
-    r_e: Any, v_e: Any, q_mu: Any, r_e_hat: Any, v_e_hat: Any, q_mu_hat: Any
-) -> Any:
-    """Error of an estimate as reported, estimate minus truth, in the coordinates of P.
-
-    Parameters
-    ----------
-    r_e, v_e : SX, shape (3,)
-        True position [m] and velocity [m/s].
-    q_mu : SX, shape (4,)
-        True misalignment.
-    r_e_hat, v_e_hat, q_mu_hat : SX
-        The estimates.
-
-    Returns
-    -------
-    SX, shape (9,)
-        Position [m], velocity [m/s], misalignment [rad]; the last is the rotation vector that
-        takes the true to the estimated antenna axes.
-    """
-    turn = rotation_vector(product(q_mu_hat, inverse(q_mu)))
-    return ca.vertcat(r_e_hat - r_e, v_e_hat - v_e, turn)
+def _navigation_error(*values: Any) -> Any:
+    names = [block.name for block in STATE]
+    truth, estimate = (dict(zip(names, part, strict=True)) for part in (values[:3], values[3:]))
+    return STATE.difference(estimate, truth)
 
 
-navigation_error_array = over_members(navigation_error, (3,), (3,), (4,), (3,), (3,), (4,))
+navigation_error_array = over_members(_navigation_error, (3,), (3,), (4,), (3,), (3,), (4,))
+"""Estimate minus truth (m, 9) of arrays of truth and estimate: r_e, v_e, q_mu; r_e, v_e, q_mu."""

@@ -98,8 +98,8 @@ class Nees(Consistency):
     merged = ("nees_sum", "nees_n")
 
     def degrees(self, layout: Layout, sums: Sums) -> FloatArray:
-        """As many as axes."""
-        return np.full(len(sums["nees_n"]), float(len(layout.labels)))
+        """As many as axes that it is of."""
+        return np.full(len(sums["nees_n"]), float(layout.nees_axes))
 
     def counted(self, sums: Sums) -> NDArray[np.bool_]:
         """Those at fixes, where there are any."""
@@ -117,10 +117,10 @@ class Nees(Consistency):
 
 
 class Nis(Consistency):
-    """Normalized innovation squared, and the test of its sum."""
+    """Normalized innovation squared, and the test of its sum; of several measurements, of each."""
 
     name = "nis"
-    merged = ("nis_sum", "nis_n", "dof")
+    merged = ("nis_sum", "nis_n", "dof", "nis_of_sum", "nis_of_n", "nis_of_dof")
     families = ("NIS",)
     spoiled_by_bias = True
 
@@ -135,27 +135,64 @@ class Nis(Consistency):
         return int(n.sum())
 
     def sum(self, members: Members) -> Sums:
-        """The degrees of freedom too."""
+        """The degrees of freedom too; and over all epochs of each measurement."""
         if not members.layout.has_innovation:
             return {}
-        finite = np.isfinite(members.history["nis"])
-        dof = np.where(finite, members.history["nis_dof"], 0.0).sum(axis=1)
-        return super().sum(members) | {"dof": dof}
+        dof = _total(members.history["nis_dof"], axis=1)
+        names = [f"{name}_nis" for name in members.layout.measurements] or ["nis"]
+        values = [members.history[name] for name in names]
+        return super().sum(members) | {
+            "dof": dof,
+            "nis_of_sum": np.array([_total(v) for v in values]),
+            "nis_of_n": np.array([np.isfinite(v).sum() for v in values], dtype=np.int64),
+            "nis_of_dof": np.array([_total(members.history[f"{name}_dof"]) for name in names]),
+        }
+
+    def summarize(self, layout: Layout, sums: Sums) -> dict[str, Any]:
+        """Means of each measurement too, where there are several."""
+        found = super().summarize(layout, sums)
+        n = np.maximum(sums["nis_of_n"], 1)
+        for k, name in enumerate(layout.measurements):
+            mean = sums["nis_of_sum"][k] / n[k] if sums["nis_of_n"][k] else None
+            found["nis"].setdefault("of", {})[name] = {
+                "mean": mean if mean is None else float(mean),
+                "dof": float(sums["nis_of_dof"][k] / n[k]),
+                "n": int(sums["nis_of_n"][k]),
+            }
+        return found
+
+    def facts(self, summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """One sentence, and one of each measurement."""
+        yield from super().facts(summary)
+        for name, of in (summary.get("nis") or {}).get("of", {}).items():
+            if of["mean"] is not None:
+                yield (
+                    f"NIS of {name}",
+                    f"{number(of['mean'])} on average, expected {number(of['dof'])}, "
+                    f"over {of['n']} innovations",
+                )
 
     def judge(self, layout: Layout, sums: Sums, share: float) -> Evidence:
-        """Test the sum over everything."""
-        del layout
-        total, dof, n = sums["nis_sum"].sum(), sums["dof"].sum(), int(sums["nis_n"].sum())
-        if not dof:
+        """Test the sum over everything, measurement by measurement."""
+        total, n, dof = (sums[f"nis_of_{what}"] for what in ("sum", "n", "dof"))
+        given = np.flatnonzero(dof)
+        if not len(given):
             return [], 0
 
         def describe(worst: Any) -> str:
-            del worst
+            k = int(given[worst])
+            of = f" of {layout.measurements[k]}" if layout.measurements else ""
             return (
-                f"NIS is {total / n:.4g} on average, expected {dof / n:.4g}, over {n} innovations"
+                f"NIS{of} is {total[k] / n[k]:.4g} on average, expected "
+                f"{dof[k] / n[k]:.4g}, over {n[k]} innovations"
             )
 
-        return judge_ratios(np.array([total / dof]), np.array([dof]), describe, share)
+        return judge_ratios(total[given] / dof[given], dof[given], describe, share)
+
+
+def _total(values: FloatArray, axis: int | None = None) -> Any:
+    """Sum of what is finite."""
+    return np.where(np.isfinite(values), values, 0.0).sum(axis=axis)
 
 
 def _bounds(dof: FloatArray, n: NDArray[np.int64]) -> FloatArray:

@@ -39,6 +39,10 @@ class Layout:
         [s]
     has_covariance, has_innovation : bool
         Whether it publishes a covariance, and innovations.
+    nees_axes : int
+        Number of axes that its NEES is of.
+    measurements : tuple of str
+        Names of several measurements whose NIS it publishes one by one.
     """
 
     path: str
@@ -46,6 +50,8 @@ class Layout:
     times: FloatArray
     has_covariance: bool
     has_innovation: bool
+    nees_axes: int
+    measurements: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, path: str, component: Evaluation, times: FloatArray) -> Layout:
@@ -57,6 +63,8 @@ class Layout:
             times,
             "covariance" in outputs,
             "normalized_innovation" in outputs,
+            component.nees_axes or sum(len(q.axes) for q in component.quantities),
+            component.measurements,
         )
 
     @property

@@ -117,20 +117,29 @@ class TrackerEvaluation(FilterEvaluation):
     error_state, observation = STATE, RANGE
 
 
-def tracker(*, chain=False, every="1", predict=None, **sensor):
+class BothEvaluation(FilterEvaluation):
+    """Errors of the tracker that has two sensors; NEES of the speed alone."""
+
+    default_rate = tf.Rate("1")
+    error_state, judged = STATE, ("v",)
+    observations = {"range": RANGE, "speed": SPEED}  # noqa: RUF012
+    called = {"r": "distance"}  # noqa: RUF012
+
+
+def tracker(*, chain=False, every="1", predict=None, judge=None, speed_sigma=0.5, **sensor):
     with tf.System("tracker", duration="60", seed=3) as system:
         truth = system.add(Truth(), "truth")
         ranger = system.add(RangeSensor(**sensor), "ranger")
         predict = system.add(predict or TrackerPredict(), "predict")
         correct = system.add(RangeCorrect(), "correct")
-        judge = system.add(TrackerEvaluation(), "judge")
+        judge = system.add(judge or TrackerEvaluation(), "judge")
         system.connect(truth["r"], ranger["x"])
         system.connect(ranger["fix"], correct["fix"])
         system.connect(predict["prior"], correct["prior"])
         last = correct
         if chain:
             speeder = system.add(
-                SpeedSensor(sigma=0.5, rate=tf.Rate(every, offset=every)), "speeder"
+                SpeedSensor(sigma=speed_sigma, rate=tf.Rate(every, offset=every)), "speeder"
             )
             last = system.add(SpeedCorrect(), "second")
             system.connect(truth["v"], speeder["x"])
@@ -139,7 +148,11 @@ def tracker(*, chain=False, every="1", predict=None, **sensor):
             system.connect(correct["posterior"], last["earlier"])
         system.connect(last["posterior"], predict["posterior"])
         system.connect(last["estimate"], judge["estimate"])
-        system.connect(correct["innovation"], judge["innovation"])
+        if "innovation" in judge.ports:
+            system.connect(correct["innovation"], judge["innovation"])
+        else:
+            system.connect(correct["innovation"], judge["range_innovation"])
+            system.connect(last["innovation"], judge["speed_innovation"])
         for name in ("r", "v"):
             system.connect(truth[name], judge[name])
     return system
@@ -206,6 +219,68 @@ def test_a_campaign_calls_it_by_its_name(settings, word):
     made = {name: make() for name, make in settings.items()}
     verdict = run_campaign(tracker(**made), runs=100, workers=1).verdicts["judge"]
     assert verdict.words[0] == word, verdict.text
+
+
+def test_each_of_several_measurements_is_judged_by_its_own():
+    """Ranges every second, speeds every third: 60 and 20 fixes, of one degree of freedom each."""
+    system = tracker(chain=True, every="3", judge=BothEvaluation())
+    result = tf.simulate(system, members=200)
+    found = {
+        name: result.dataset[f"judge.{name}"].values for name in system.find("judge").outputs()
+    }
+    counts = [np.isfinite(found[f"{name}_nis"]).sum() / 200 for name in ("range", "speed")]
+    assert counts == [60, 20]
+    both = np.where(np.isfinite(found["speed_nis"]), found["speed_nis"], 0.0)
+    np.testing.assert_allclose(found["nis"], found["range_nis"] + both, rtol=1e-12)
+    np.testing.assert_array_equal(found["nis_dof"][1:, 0], 20 * [1, 1, 2])
+    z = found["normalized_innovation"]
+    np.testing.assert_allclose(z[:, :, 0] ** 2, found["range_nis"], rtol=1e-9)
+    np.testing.assert_allclose(z[:, :, 1] ** 2, found["speed_nis"], rtol=1e-9)
+    # NEES of the speed alone: its error over its sigma, squared
+    squared = (found["v_error"] / found["v_sigma"])[..., 0] ** 2
+    np.testing.assert_allclose(found["nees"], squared, rtol=1e-9)
+    assert result.evaluation["nees"]["dof"] == 1
+    assert [fix["of"] for fix in result.evaluation["fixes"]][:4] == ["range"] * 3 + ["speed"]
+    for name in ("nis", "range_nis", "speed_nis"):
+        low, high = result.evaluation[name]["interval_95"]
+        assert low - 0.02 < result.evaluation[name]["mean"] < high + 0.02
+    assert "range: fixes 60, accepted 100.0%" in str(result)
+    assert "speed: fixes 20, accepted 100.0%" in str(result)
+    assert "NIS of range mean" in str(result)
+
+
+def test_a_campaign_names_the_measurement_that_is_worse_than_it_says():
+    """Speeds of sigma 1 that claim 0.25: their NIS is 9 or so, that of the ranges below 1.1."""
+
+    class Boastful(SpeedSensor):
+        def build_model(self):
+            model = super().build_model()
+            return Model(
+                "boastful",
+                inputs=model.inputs,
+                parameters=model.parameters,
+                noise=model.noise,
+                outputs={**model.outputs, "fix.R": model.parameters["sigma"] ** 2 / 16},
+            )
+
+    sound = tracker(chain=True, every="3", judge=BothEvaluation())
+    verdict = run_campaign(sound, runs=100, workers=1).verdicts["judge"]
+    assert verdict.words[0] == "consistent", verdict.text
+    bad = tracker(chain=True, every="3", judge=BothEvaluation())
+    bad.replace("speeder", Boastful(sigma=1.0, rate=tf.Rate("3", offset="3")))
+    campaign = run_campaign(bad, runs=100, workers=1)
+    said = [f.text for f in campaign.verdicts["judge"].findings if f.text.startswith("NIS")]
+    assert said
+    assert said[0].startswith("NIS of speed is "), said
+    assert "NIS of range" in str(campaign)
+    assert campaign.summary()["evaluation"]["nees"]["dof"] == 1
+
+
+def test_a_block_that_is_none_cannot_be_judged():
+    with pytest.raises(ValueError, match=r"judged names 'w', which is no block .* are r, v"):
+
+        class Wrong(FilterEvaluation):
+            error_state, judged = STATE, ("w",)
 
 
 def test_a_parameter_that_the_process_names_must_be_declared():

@@ -22,7 +22,7 @@ ALL = np.inf  # a share of the level at which everything is found
 
 def layout(n_axes=1, n_epochs=1, *, covariance=True):
     axes = tuple("xyz"[:n_axes])
-    return Layout("e", (("q", "m", axes),), np.arange(float(n_epochs)), covariance, True)
+    return Layout("e", (("q", "m", axes),), np.arange(float(n_epochs)), covariance, True, len(axes))
 
 
 def history(error, P, z=None):

@@ -15,7 +15,7 @@ from terrafix.cosim.campaign.verdict import judge
 
 def layout(n_axes=3, n_epochs=5):
     axes = tuple("abc"[:n_axes])
-    return Layout("e", (("q", "m", axes),), np.arange(float(n_epochs)), True, True)
+    return Layout("e", (("q", "m", axes),), np.arange(float(n_epochs)), True, True, len(axes))
 
 
 def random_history(rng, n_members, n_axes=3, n_epochs=5):

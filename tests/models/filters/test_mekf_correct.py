@@ -416,3 +416,25 @@ def test_a_fix_may_measure_the_effective_velocity(case, update):
     wrong, _ = mekf_correct_model(update, "effective").advance(**values)
     assert wrong["innovation.nis"] > 1e4  # a speed that is taken for an effective velocity
     assert by_speed["innovation.nis"] < 30
+
+
+def test_what_passes_between_the_parts_follows_from_the_filter():
+    """The declared fields of estimate, fix and innovation are those of its error state."""
+    from terrafix.components.fields import ESTIMATE, FIX, INNOVATION
+    from terrafix.components.filters.family import (
+        estimate_fields,
+        fix_fields,
+        innovation_fields,
+    )
+    from terrafix.models.filters.spacecraft import STATE, sar_observation
+
+    seen = sar_observation()
+    for declared, derived in (
+        (ESTIMATE, estimate_fields(STATE)),
+        (FIX, fix_fields(seen)),
+        (INNOVATION, innovation_fields(seen)),
+    ):
+        assert list(declared) == list(derived)
+        for name, field in declared.items():
+            assert (field.shape, field.frame) == (derived[name].shape, derived[name].frame)
+            assert name in ("P", "R") or field.unit == derived[name].unit
