@@ -25,7 +25,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from terrafix.cosim.declare.parameters import Choice, Parameter
-from terrafix.cosim.declare.ports import BundleInput, BundleOutput, MessageInput, MessageOutput
+from terrafix.cosim.declare.ports import (
+    BundleInput,
+    BundleOutput,
+    MessageInput,
+    MessageOutput,
+)
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.fields import Field, Unit
 from terrafix.models.core.model import Model
@@ -101,6 +106,30 @@ def declare(cls: type, **ports: Any) -> None:
             port.__set_name__(cls, name)
 
 
+def _correct_ports(state: ErrorState, observation: Observation) -> dict[str, Any]:
+    """Ports and gate of a correction."""
+    fields, m = estimate_fields(state), observation.size
+    return {
+        "gate": Parameter(
+            np.inf,
+            shape=(m,),
+            infinite=True,
+            positive=True,
+            doc=f"largest NIS accepted with 1 to {m} elements; infinity accepts all",
+        ),
+        "prior": BundleInput(fields, doc="estimate before the fix"),
+        "earlier": MessageInput(
+            fields=fields, optional=True, doc="posterior of the correction before this one"
+        ),
+        "fix": MessageInput(fields=fix_fields(observation), doc="the fix"),
+        "estimate": BundleOutput(fields, doc="the posterior where there is one, or the prior"),
+        "posterior": MessageOutput(fields=fields, doc="the estimate, where it was corrected"),
+        "innovation": MessageOutput(
+            fields=innovation_fields(observation), doc="what became of the fix"
+        ),
+    }
+
+
 class FilterPredict(SymbolicComponent):
     """The estimate between fixes, and the covariance of its error: base of a filter's own.
 
@@ -173,6 +202,7 @@ class FilterCorrect(SymbolicComponent):
 
     error_state: ClassVar[ErrorState]
     observation: ClassVar[Observation]
+    of_ensembles: ClassVar[bool] = False
 
     update = Choice(UPDATES, "ekf", doc="how the measurement is weighed")
     underweighting = Parameter(0.0, minimum=0.0, doc="Lear's factor on H P H'")
@@ -180,27 +210,14 @@ class FilterCorrect(SymbolicComponent):
 
     def __init_subclass__(cls, **options: Any) -> None:
         if "error_state" in vars(cls):
-            fields, m = estimate_fields(cls.error_state), cls.observation.size
-            declare(
-                cls,
-                gate=Parameter(
-                    np.inf,
-                    shape=(m,),
-                    infinite=True,
-                    positive=True,
-                    doc=f"largest NIS accepted with 1 to {m} elements; infinity accepts all",
-                ),
-                prior=BundleInput(fields, doc="estimate before the fix"),
-                earlier=MessageInput(
-                    fields=fields, optional=True, doc="posterior of the correction before this one"
-                ),
-                fix=MessageInput(fields=fix_fields(cls.observation), doc="the fix"),
-                estimate=BundleOutput(fields, doc="the posterior where there is one, or the prior"),
-                posterior=MessageOutput(fields=fields, doc="the estimate, where it was corrected"),
-                innovation=MessageOutput(
-                    fields=innovation_fields(cls.observation), doc="what became of the fix"
-                ),
-            )
+            if cls.observation.of_ensembles != cls.of_ensembles:
+                kind = "a function of ensembles" if cls.observation.of_ensembles else "symbolic"
+                base = "EnsembleCorrect" if cls.observation.of_ensembles else "FilterCorrect"
+                raise ValueError(
+                    f"the observation of {cls.__name__} is {kind}: derive the class from {base}, "
+                    f"not from {cls.__mro__[1].__name__}"
+                )
+            declare(cls, **_correct_ports(cls.error_state, cls.observation))
         super().__init_subclass__(**options)
 
     def build_model(self) -> Model:

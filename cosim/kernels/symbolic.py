@@ -313,7 +313,8 @@ class SymbolicComponent(Component):
 
     def _unfinished_start(self, m: int) -> str:
         """Why the start of member number `m` is not finite, as far as its inputs tell."""
-        signals = [n for n in self.model.inputs if self.ports[n.partition(".")[0]].kind == "signal"]
+        heads = {n: self.ports.get(n.partition(".")[0]) for n in self.model.inputs}
+        signals = [n for n, port in heads.items() if port is not None and port.kind == "signal"]
         unwritten = [n for n in signals if not np.isfinite(self._input_array(n)[m]).all()]
         if not unwritten:
             return "start is not finite"

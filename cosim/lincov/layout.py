@@ -45,7 +45,7 @@ class Wires:
             ) from None
         self.symbolic: dict[str, SymbolicComponent] = {}
         for path, component in self._components.items():
-            if isinstance(component, SymbolicComponent):
+            if isinstance(component, SymbolicComponent) and component.capabilities.symbolic:
                 self.symbolic[path] = component
             elif component is not self.evaluation:
                 raise ConfigurationError(

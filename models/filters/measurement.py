@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 
@@ -70,6 +70,7 @@ class Observation:
     inputs: Mapping[str, int] = field(default_factory=dict)
     parameters: Mapping[str, int] = field(default_factory=dict)
     instant: str = ""
+    of_ensembles: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         names = [block.name for block in self.fields]
@@ -126,11 +127,7 @@ class Observation:
         ValueError
             If what is predicted has another size, or is of an instant without a clone.
         """
-        if self.instant and self.instant not in state.instants:
-            raise ValueError(
-                f"an observation is of the instant '{self.instant}', of which there is no clone; "
-                f"the instants are {', '.join(state.instants) or 'none'}"
-            )
+        self.check_instant(state)
         error = ca.SX.sym("error", state.size)
         told = {block.name: message[block.name] for block in self.fields}
         uncertain = {name: ca.SX.sym(name, *told[name].shape) for name in self.mapped}
@@ -162,8 +159,25 @@ class Observation:
             at(ca.jacobian(y, error)),
             noise,
             message["present"],
-            tuple(k for k, label in enumerate(self.elements) if label in self.angles),
+            self.angular,
         )
+
+    @property
+    def angular(self) -> tuple[int, ...]:
+        """Which elements are angles."""
+        return tuple(k for k, label in enumerate(self.elements) if label in self.angles)
+
+    def check_instant(self, state: ErrorState) -> None:
+        """Raise ValueError if it is of an instant without a clone."""
+        if self.instant and self.instant not in state.instants:
+            raise ValueError(
+                f"an observation is of the instant '{self.instant}', of which there is no clone; "
+                f"the instants are {', '.join(state.instants) or 'none'}"
+            )
+
+    def answers(self) -> dict[str, Any]:
+        """Symbols of predictions that are made elsewhere; none, if it is an expression itself."""
+        return {}
 
 
 @dataclass(frozen=True)

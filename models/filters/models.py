@@ -225,7 +225,7 @@ def correct_model(
     states = {"n_updates": n_updates} if underweighting else {}
     return Model(
         name,
-        inputs={**messages, **inputs},
+        inputs={**messages, **inputs, **observation.answers()},
         states=states,
         parameters={**parameters, **counted, "gate": gate},
         next={"n_updates": n_updates + arrived} if states else {},
