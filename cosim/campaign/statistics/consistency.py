@@ -32,7 +32,7 @@ class Consistency(Statistic):
         """Epochs that count over all."""
         return np.asarray(sums[f"{self.name}_n"] > 0)
 
-    def independent(self, n: NDArray[np.int64]) -> int:
+    def independent(self, layout: Layout, n: NDArray[np.int64]) -> int:
         """How many independent values the mean over all epochs has, given how many each has."""
         raise NotImplementedError
 
@@ -73,7 +73,9 @@ class Consistency(Statistic):
             self.name: {
                 "mean": float(np.average(mean, weights=n)),
                 "dof": float(np.average(dof, weights=n)),
-                "interval_95": list(chi_square_interval(float(np.mean(dof)), self.independent(n))),
+                "interval_95": list(
+                    chi_square_interval(float(np.mean(dof)), self.independent(layout, n))
+                ),
                 "fraction_inside": float(inside.mean()),
             }
         }
@@ -107,7 +109,7 @@ class Nees(Consistency):
         at_fixes = given & (sums["nis_n"] > 0) if "nis_n" in sums else given
         return at_fixes if at_fixes.any() else given
 
-    def independent(self, n: NDArray[np.int64]) -> int:
+    def independent(self, layout: Layout, n: NDArray[np.int64]) -> int:
         """As many as members: an interval is that of a single epoch."""
         return int(n.max())
 
@@ -130,9 +132,9 @@ class Nis(Consistency):
         n = sums["nis_n"]
         return np.where(n > 0, sums["dof"] / np.maximum(n, 1), 0.0)
 
-    def independent(self, n: NDArray[np.int64]) -> int:
-        """Every value: innovations are white."""
-        return int(n.sum())
+    def independent(self, layout: Layout, n: NDArray[np.int64]) -> int:
+        """Every value, where innovations are white; else as many as members."""
+        return int(n.sum() if layout.white else n.max())
 
     def sum(self, members: Members) -> Sums:
         """The degrees of freedom too; and over all epochs of each measurement."""
@@ -187,7 +189,9 @@ class Nis(Consistency):
                 f"{dof[k] / n[k]:.4g}, over {n[k]} innovations"
             )
 
-        return judge_ratios(total[given] / dof[given], dof[given], describe, share)
+        # alike all the time, at worst: they say no more than those of one epoch
+        epochs = 1 if layout.white else int((sums["nis_n"] > 0).sum())
+        return judge_ratios(total[given] / dof[given], dof[given] / epochs, describe, share)
 
 
 def _total(values: FloatArray, axis: int | None = None) -> Any:

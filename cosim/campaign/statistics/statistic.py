@@ -43,6 +43,8 @@ class Layout:
         Number of axes that its NEES is of.
     measurements : tuple of str
         Names of several measurements whose NIS it publishes one by one.
+    white : bool
+        Whether innovations of a sound filter are white.
     """
 
     path: str
@@ -52,6 +54,7 @@ class Layout:
     has_innovation: bool
     nees_axes: int
     measurements: tuple[str, ...] = ()
+    white: bool = True
 
     @classmethod
     def of(cls, path: str, component: Evaluation, times: FloatArray) -> Layout:
@@ -65,6 +68,7 @@ class Layout:
             "normalized_innovation" in outputs,
             component.nees_axes or sum(len(q.axes) for q in component.quantities),
             component.measurements,
+            component.white,
         )
 
     @property
