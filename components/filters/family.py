@@ -140,7 +140,8 @@ class FilterPredict(SymbolicComponent):
     told : tuple of str
         Blocks that the start message tells; the others start at zero, with a sigma.
     sigmas : dict of str to str
-        Of the others: the parameter that holds it, ``NAME_sigma0`` unless said otherwise.
+        Of the others: the parameter that holds it, ``NAME_sigma0`` unless said otherwise;
+        a stationary Gauss-Markov block's may be the one that its process names.
     """
 
     error_state: ClassVar[ErrorState]

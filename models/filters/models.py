@@ -82,7 +82,8 @@ def predict_model(
         made = state.cloned(begin, instant, time - step)
         begin = {key: ca.if_else(mark > 0.5, made[key], begin[key]) for key in begin}
     moved = propagate(state, process, begin, {**inputs, **parameters}, step, time)
-    sigma = {key: ca.SX.sym(key) for key in sigmas.values()}
+    # one that the process knows as well is the same: a stationary Gauss-Markov process's
+    sigma = {key: parameters.get(key, ca.SX.sym(key)) for key in sigmas.values()}
     start, initial = _start(state, told, {block: sigma[key] for block, key in sigmas.items()})
     following = {**begin, **moved.values, "P": moved.covariance(begin["P"])}
     free = ca.symvar(ca.vertcat(*(ca.vec(ca.SX(value)) for value in following.values())))

@@ -228,6 +228,20 @@ def test_a_filter_starts_from_what_it_is_told_and_from_sigmas():
     assert np.count_nonzero(got) == 4
 
 
+def test_one_parameter_is_the_sigma_at_the_start_and_that_of_the_process():
+    """A stationary Gauss-Markov process is as uncertain at t = 0 as ever after."""
+    process = Process(decays={"b": ("tau", "sigma")})
+    model = predict_model("p", ErrorState(vector("b", 1)), process, told=(), sigmas={"b": "sigma"})
+    assert list(model.parameters) == ["tau", "sigma"]
+    symbols = [model.states["P"], *model.parameters.values(), model.step]
+    start = ca.Function("start", symbols, [model.initial["P"]])
+    following = ca.substitute(model.next["P"], model.inputs["posterior.fresh"], 0)
+    following = ca.Function("following", symbols, [following])
+    P = start(0, 5, 2, 1)
+    assert float(P) == 4.0
+    assert float(following(P, 5, 2, 1)) == pytest.approx(4.0, rel=1e-15)
+
+
 @pytest.mark.parametrize(
     ("told", "sigmas", "said"),
     [
