@@ -30,6 +30,7 @@ from terrafix.cosim.declare.ports import (
     BundleOutput,
     MessageInput,
     MessageOutput,
+    Output,
 )
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.fields import Field, Unit
@@ -130,6 +131,32 @@ def _correct_ports(state: ErrorState, observation: Observation) -> dict[str, Any
     }
 
 
+def transition_ports(state: ErrorState) -> tuple[Output, Output]:
+    """Ports of what a smoother needs besides the estimates: the transition, and since when.
+
+    Raises
+    ------
+    ValueError
+        If a block is considered, which cannot be smoothed.
+    """
+    kept = [block.name for block in state if block.considered]
+    if kept:
+        raise ValueError(
+            f"{', '.join(kept)} is considered, not corrected: such a filter's estimate is no "
+            "optimum, and cannot be smoothed\n  leave `smoothed` out, or estimate it"
+        )
+    shape = (state.size, state.size)
+    return (
+        Output(shape, doc=f"{TRANSITION_OF}{state.text}"),
+        Output((1,), unit="s", doc="time that the transition counts from"),
+    )
+
+
+TRANSITION, SINCE = "error_transition", "transition_since"
+TRANSITION_OF = "of the error of "
+"""How the description of a transition's port begins; the error state's text follows."""
+
+
 class FilterPredict(SymbolicComponent):
     """The estimate between fixes, and the covariance of its error: base of a filter's own.
 
@@ -148,8 +175,12 @@ class FilterPredict(SymbolicComponent):
     process: ClassVar[Process]
     told: ClassVar[tuple[str, ...]] = ()
     sigmas: ClassVar[dict[str, str]] = {}
+    smoothed: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
+        if cls.smoothed and hasattr(cls, "error_state"):
+            transition, since = transition_ports(cls.error_state)
+            declare(cls, **{TRANSITION: transition, SINCE: since})
         if "error_state" in vars(cls):
             state = cls.error_state
             fields = estimate_fields(state)
@@ -189,6 +220,7 @@ class FilterPredict(SymbolicComponent):
             self.process,
             told=self.told,
             sigmas=self._sigmas,
+            smoothed=self.smoothed,
         )
 
 

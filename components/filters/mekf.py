@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from terrafix.components.fields import ESTIMATE, FIX, INNOVATION, KNOWN_STATE
+from terrafix.components.filters.family import transition_ports
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import (
@@ -24,6 +25,7 @@ from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
 from terrafix.models.filters.spacecraft import (
     JACOBIANS,
+    STATE,
     TRANSITIONS,
     mekf_correct_model,
     mekf_predict_model,
@@ -62,6 +64,16 @@ class MekfPredict(SymbolicComponent):
     def build_model(self) -> Model:
         """Build the model for the chosen gravity and transition."""
         return mekf_predict_model(self.gravity, self.transition)
+
+
+class SmoothedMekfPredict(MekfPredict):
+    """Dead reckoning between fixes that puts out what a smoother of the recorded run needs."""
+
+    error_transition, transition_since = transition_ports(STATE)
+
+    def build_model(self) -> Model:
+        """Build the model for the chosen gravity and transition."""
+        return mekf_predict_model(self.gravity, self.transition, smoothed=True)
 
 
 class MekfCorrect(SymbolicComponent):

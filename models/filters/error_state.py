@@ -318,20 +318,50 @@ class ErrorState:
         J = self.recentering(correction)
         return mirrored(ca.mtimes(J, ca.mtimes(P, J.T)))
 
-    def cloned(self, values: Values, instant: str, time: Any) -> dict[str, Any]:
-        """An estimate (values, ``P``) whose clones of an instant are those of now."""
-        made = dict(values)
+    def cloning(self, instant: str) -> Any:
+        """Derivative (n, n) of the error with clones of an instant made anew by that before."""
         J = ca.SX.eye(self.size)
         for block in self.blocks:
             if block.instant == instant:
                 own, of = self.places[block.name], self.places[block.clone_of]
-                made[block.name] = values[block.clone_of]
                 J[own, :] = 0
                 for k in range(block.size):
                     J[own.start + k, of.start + k] = 1
+        return J
+
+    def cloned(self, values: Values, instant: str, time: Any) -> dict[str, Any]:
+        """An estimate (values, ``P``) whose clones of an instant are those of now."""
+        J = self.cloning(instant)
+        made = dict(values)
+        made |= {b.name: values[b.clone_of] for b in self.blocks if b.instant == instant}
         made["P"] = mirrored(ca.mtimes(J, ca.mtimes(mirrored(values["P"]), J.T)))
         made[f"t_{instant}"] = time
         return made
+
+    @property
+    def text(self) -> str:
+        """Its blocks in a line, for records: ``"r_e 3, v_e 3, q_mu left"``."""
+        return ", ".join(f"{b.name} {b.side or b.size}" for b in self.blocks)
+
+    @classmethod
+    def from_text(cls, text: str) -> ErrorState:
+        """Read blocks as `text` writes them: names, sizes and sides.
+
+        Raises
+        ------
+        ValueError
+            If it is none.
+        """
+        blocks = []
+        for part in text.split(","):
+            name, _, kind = part.strip().partition(" ")
+            if kind in SIDES:
+                blocks.append(rotation(name, side=kind))
+            elif kind.isdecimal():
+                blocks.append(vector(name, int(kind)))
+            else:
+                raise ValueError(f"'{part.strip()}' is no block: a name, and a size or a side")
+        return cls(*blocks)
 
     @property
     def kept(self) -> tuple[int, ...]:

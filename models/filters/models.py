@@ -31,6 +31,7 @@ def predict_model(
     *,
     told: Sequence[str],
     sigmas: Mapping[str, str],
+    smoothed: bool = False,
 ) -> Model:
     """The estimate between fixes, and the covariance of its error.
 
@@ -45,6 +46,9 @@ def predict_model(
     sigmas : mapping of str to str
         Of the other blocks, which start at zero (no rotation): the parameter that holds the sigma
         of each of their elements.
+    smoothed : bool
+        Put out besides what a smoother needs: the transition of the error since the posterior that
+        the estimate began with, or the start.
 
     Returns
     -------
@@ -52,7 +56,8 @@ def predict_model(
         Inputs of the process; ``posterior.*`` and the flag ``posterior.fresh``, which makes the
         step begin there; ``INSTANT.fresh``, which makes its clones anew at the start of the step;
         for the start alone ``start.*`` of the blocks told, and ``start.P``.
-        Outputs ``prior.*``.
+        Outputs ``prior.*``; ``error_transition`` (n, n) and the time
+        ``transition_since`` [s], if `smoothed`.
 
     Raises
     ------
@@ -78,14 +83,27 @@ def predict_model(
     fresh, step, time = (ca.SX.sym(key) for key in ("posterior_fresh", "dt", "time"))
     begin = {key: ca.if_else(fresh > 0.5, posterior[key], own[key]) for key in own}
     marks = {instant: ca.SX.sym(f"{instant}_fresh") for instant in state.instants}
+    gone = ca.SX.sym("transition", state.size, state.size)
+    phi = ca.if_else(fresh > 0.5, ca.SX.eye(state.size), gone)
     for instant, mark in marks.items():
         made = state.cloned(begin, instant, time - step)
         begin = {key: ca.if_else(mark > 0.5, made[key], begin[key]) for key in begin}
+        phi = ca.if_else(mark > 0.5, ca.mtimes(state.cloning(instant), phi), phi)
     moved = propagate(state, process, begin, {**inputs, **parameters}, step, time)
     # one that the process knows as well is the same: a stationary Gauss-Markov process's
     sigma = {key: parameters.get(key, ca.SX.sym(key)) for key in sigmas.values()}
     start, initial = _start(state, told, {block: sigma[key] for block, key in sigmas.items()})
     following = {**begin, **moved.values, "P": moved.covariance(begin["P"])}
+    states = dict(own)
+    outputs = {f"prior.{key}": symbol for key, symbol in own.items()}
+    if smoothed:
+        since = ca.SX.sym("since")
+        following["error_transition"] = ca.mtimes(moved.transition, phi)
+        following["transition_since"] = ca.if_else(fresh > 0.5, time - step, since)
+        initial["error_transition"] = ca.densify(ca.SX.eye(state.size))
+        carried = {"error_transition": gone, "transition_since": since}
+        states |= carried
+        outputs |= carried
     free = ca.symvar(ca.vertcat(*(ca.vec(ca.SX(value)) for value in following.values())))
     uses_time = time.element_hash() in {element.element_hash() for element in free}
     return Model(
@@ -97,11 +115,11 @@ def predict_model(
             **{f"{instant}.fresh": mark for instant, mark in marks.items()},
             **start,
         },
-        states=own,
+        states=states,
         parameters={**parameters, **sigma},
         next=following,
         initial=initial,
-        outputs={f"prior.{key}": symbol for key, symbol in own.items()},
+        outputs=outputs,
         step=step,
         time=time if uses_time else None,
     )

@@ -56,7 +56,9 @@ STATE = ErrorState(
 """Position, velocity, and the antenna's misalignment: nominal to actual axes."""
 
 
-def mekf_predict_model(gravity: str = "j2", transition: str = "exact") -> Model:
+def mekf_predict_model(
+    gravity: str = "j2", transition: str = "exact", *, smoothed: bool = False
+) -> Model:
     """Dead reckoning between fixes, and the covariance of its error.
 
     Parameters
@@ -66,6 +68,8 @@ def mekf_predict_model(gravity: str = "j2", transition: str = "exact") -> Model:
     transition : {"exact", "printed"}
         Transition matrix: the exponential of A, or eq. (13) of [1]_, without Coriolis block, which
         makes the filter inconsistent and is kept as a negative control.
+    smoothed : bool
+        Put out the transition of the error too, as `predict_model` does.
 
     Returns
     -------
@@ -87,6 +91,7 @@ def mekf_predict_model(gravity: str = "j2", transition: str = "exact") -> Model:
         spacecraft_process(gravity, transition),
         told=("r_e", "v_e"),
         sigmas={"q_mu": "misalignment_sigma0"},
+        smoothed=smoothed,
     )
 
 
