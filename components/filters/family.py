@@ -29,11 +29,16 @@ from terrafix.cosim.declare.ports import BundleInput, BundleOutput, MessageInput
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.fields import Field, Unit
 from terrafix.models.core.model import Model
+from terrafix.models.filters.consistency import gate_thresholds
 from terrafix.models.filters.error_state import Block, ErrorState
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.models import correct_model, predict_model
 from terrafix.models.filters.process import Process
+from terrafix.models.filters.robust import HUBER, WEIGHTS
 from terrafix.models.filters.updates import UPDATES
+
+USUAL = 0.99
+"""Share of good fixes that weights by their NIS take as they are, unless said otherwise."""
 
 
 def value_field(block: Block) -> Field:
@@ -170,6 +175,10 @@ class FilterCorrect(SymbolicComponent):
     observation: ClassVar[Observation]
 
     update = Choice(UPDATES, "ekf", doc="how the measurement is weighed")
+    weights = Choice(WEIGHTS, "none", doc="robust: what enlarges the noise of a fix that is far off")
+    huber_threshold = Parameter(
+        HUBER, positive=True, infinite=True, doc="largest innovation taken as it is, in sigmas"
+    )
     underweighting = Parameter(0.0, minimum=0.0, doc="Lear's factor on H P H'")
     underweighted_updates = Parameter(0.0, minimum=0.0, doc="how many fixes it applies to")
 
@@ -185,6 +194,13 @@ class FilterCorrect(SymbolicComponent):
                     positive=True,
                     doc=f"largest NIS accepted with 1 to {m} elements; infinity accepts all",
                 ),
+                nis_threshold=Parameter(
+                    gate_thresholds(USUAL, m),
+                    shape=(m,),
+                    infinite=True,
+                    positive=True,
+                    doc=f"largest NIS with 1 to {m} elements that is taken as it is",
+                ),
                 prior=BundleInput(fields, doc="estimate before the fix"),
                 earlier=MessageInput(
                     fields=fields, optional=True, doc="posterior of the correction before this one"
@@ -199,11 +215,13 @@ class FilterCorrect(SymbolicComponent):
         super().__init_subclass__(**options)
 
     def build_model(self) -> Model:
-        """Build the model for the chosen update."""
+        """Build the model for the chosen update and weights."""
+        robust = "" if self.weights == "none" else f"_{self.weights}"
         return correct_model(
-            f"{type(self).__name__.lower()}_{self.update}",
+            f"{type(self).__name__.lower()}_{self.update}{robust}",
             self.error_state,
             self.observation,
             self.update,
+            weights=self.weights,
             chained=True,
         )
