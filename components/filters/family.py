@@ -175,7 +175,9 @@ class FilterCorrect(SymbolicComponent):
     observation: ClassVar[Observation]
 
     update = Choice(UPDATES, "ekf", doc="how the measurement is weighed")
-    weights = Choice(WEIGHTS, "none", doc="robust: what enlarges the noise of a fix that is far off")
+    weights = Choice(
+        WEIGHTS, "none", doc="robust: what enlarges the noise of a fix far off"
+    )
     huber_threshold = Parameter(
         HUBER, positive=True, infinite=True, doc="largest innovation taken as it is, in sigmas"
     )

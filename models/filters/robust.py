@@ -20,9 +20,9 @@ Weights ``nis`` scale all of the noise until the normalized innovation squared i
     R' = \lambda R, \qquad \lambda = \min\left\{\lambda \ge 1 :
     \nu^T (P_{yy} + \lambda R)^{-1} \nu \le \gamma\right\}.
 
-For one element :math:`\lambda = (\nu^2 / \gamma - P_{yy}) / R`. For more, :math:`1 / \nu^T (P_{yy} +
-\lambda R)^{-1} \nu` is concave in :math:`\lambda` (a harmonic mean of straight lines), so Newton's
-method for it rises to the solution from below.
+For one element :math:`\lambda = (\nu^2 / \gamma - P_{yy}) / R`. For more, one over the left side is
+concave in :math:`\lambda`, a harmonic mean of straight lines, so that Newton's method for it rises
+to the solution from below.
 
 What is judged and published, residual, covariance and normalized square, is that of the noise as
 reported. The covariance of the posterior is that of the enlarged noise: somewhat too large where
