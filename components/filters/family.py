@@ -93,7 +93,7 @@ def innovation_fields(observation: Observation) -> dict[str, Field]:
     }
 
 
-def _declare(cls: type, **ports: Any) -> None:
+def declare(cls: type, **ports: Any) -> None:
     """Declare on a class what it does not declare itself."""
     for name, port in ports.items():
         if name not in vars(cls):
@@ -139,7 +139,7 @@ class FilterPredict(SymbolicComponent):
                 ports["start"] = MessageInput(
                     fields=start, needed_at_start=True, doc="last known state, at t = 0"
                 )
-            _declare(cls, **ports)
+            declare(cls, **ports)
         super().__init_subclass__(**options)
 
     @property
@@ -175,9 +175,7 @@ class FilterCorrect(SymbolicComponent):
     observation: ClassVar[Observation]
 
     update = Choice(UPDATES, "ekf", doc="how the measurement is weighed")
-    weights = Choice(
-        WEIGHTS, "none", doc="robust: what enlarges the noise of a fix far off"
-    )
+    weights = Choice(WEIGHTS, "none", doc="robust: what enlarges the noise of a fix far off")
     huber_threshold = Parameter(
         HUBER, positive=True, infinite=True, doc="largest innovation taken as it is, in sigmas"
     )
@@ -187,7 +185,7 @@ class FilterCorrect(SymbolicComponent):
     def __init_subclass__(cls, **options: Any) -> None:
         if "error_state" in vars(cls):
             fields, m = estimate_fields(cls.error_state), cls.observation.size
-            _declare(
+            declare(
                 cls,
                 gate=Parameter(
                     np.inf,
