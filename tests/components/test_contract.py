@@ -246,5 +246,6 @@ def _components(file: Path) -> list[str]:
     bases = ("Component", "SymbolicComponent", "NoisyComponent", "Evaluation", "Playback")
     bases += ("_Echo", "_Reference")
     derived = [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
-    bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation")  # of a filter's own classes
+    # of a filter's own classes
+    bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation", "FilterMonitor")
     return [name for name in derived if name not in bases]

@@ -54,7 +54,7 @@ def one(z, model=None, **settings):
 def test_the_sums_are_those_of_the_definition():
     """k = 0.5, h = 3: 0.5, 2.0, 1.5, 3.5 (alarm), then from 0: 0.5; and the other side."""
     z = np.array([1.0, 2.0, 0.0, 2.5, 1.0, -4.0, -1.0])
-    found = one(z[:, None], decision_interval=3.0)
+    found = one(z[:, None], monitor_model("m", 1, 3, 1e-9), decision_interval=3.0)
     assert found["mean_high"].tolist() == [0.5, 2.0, 1.5, 3.5, 0.5, 0.0, 0.0]
     assert found["mean_low"].tolist() == [0.0, 0.0, 0.0, 0.0, 0.0, 3.5, 0.5]
     assert found["alarm_valid"].tolist() == [0, 0, 0, 1, 0, 1, 0]
@@ -82,15 +82,12 @@ def test_the_window_is_the_last_fixes_and_starts_anew_after_an_alarm():
 
 def test_thresholds_are_the_quantiles_for_every_number_of_elements():
     model = monitor_model("m", 3, 4, 1e-4)
-    function = model.step_function()
-    at = list(function.name_out()).index("chi_square_threshold_")
     for dofs in ([3, 3, 3, 3], [1, 2, 3, 1], [1, 1, 1, 1], [3, 0, 0, 0]):
         flown = Flown(model, 1)
         flown.state["dofs"] = np.array(dofs, dtype=float)[:, None]
         flown.step(np.zeros((3, 1)), fresh=0)
         found = flown.step(np.zeros((3, 1)), fresh=0)["chi_square_threshold"].item()
         assert found == pytest.approx(chi2.isf(1e-4, sum(dofs)), rel=1e-12)
-    assert at >= 0
 
 
 def test_absent_elements_are_left_as_they_are():
@@ -150,33 +147,6 @@ def test_a_fix_at_the_start_counts():
 
 
 # ------------------------------------------------------------------------- rates
-
-
-@pytest.mark.parametrize(
-    ("h", "shift", "published", "rounded"),
-    [
-        (5.0, 0.0, 465.0, 0.5),
-        (4.0, 0.0, 168.0, 0.5),
-        (5.0, 1.0, 10.4, 0.05),
-        (4.0, 1.0, 8.38, 0.005),
-    ],
-)
-def test_the_average_run_length_is_that_of_the_tables(h, shift, published, rounded):
-    """Montgomery's table of the two-sided sum, k = 0.5: within four sigma of a mean of so many.
-
-    Run lengths are about exponential without a shift: a sigma of as much as the mean; every member
-    is followed until its first alarm.
-    """
-    members, rng = 4000, np.random.default_rng(2)
-    flown = Flown(monitor_model("m", 1, 1, 1e-12), members, decision_interval=h)
-    lengths = np.zeros(members)
-    for step in range(1, 100_000):
-        alarms = flown.step(rng.normal(shift, 1.0, members))["alarms"][1:].sum(axis=0)
-        lengths[(lengths == 0) & (alarms > 0)] = step
-        if lengths.all():
-            break
-    error = lengths.std() / np.sqrt(members)
-    assert abs(lengths.mean() - published) < 4 * error + rounded
 
 
 @pytest.mark.parametrize("window", [1, 8])
