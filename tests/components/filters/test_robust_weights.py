@@ -69,3 +69,15 @@ def test_a_fix_far_off_moves_the_estimate_by_what_the_definition_says(weights):
     assert out["estimate"]["P"][-1].item() == pytest.approx(R / (R + 2), rel=1e-12)
     assert out["innovation"]["nis"][-1].item() == pytest.approx(600.0, rel=1e-12)
     assert out["innovation"]["sigma"][-1].ravel() == pytest.approx(np.sqrt(2), rel=1e-12)
+
+
+@pytest.mark.parametrize("weights", WEIGHTS[1:])
+def test_a_threshold_of_infinity_is_off_in_kernels_too(weights):
+    off = {"y": [30.0, -3.0], "R": np.eye(2), "present": [1.0, 1.0]}
+    given = {"fix": {1: off}, "prior": {"r": [0.0], "P": np.eye(1)}}
+    plain = drive(Correct(), given)
+    robust = drive(Correct(weights=weights, huber_threshold=np.inf, nis_threshold=np.inf), given)
+    assert not robust.failed
+    for name in ("r", "P"):
+        expected = plain["estimate"][name][-1].item()
+        assert robust["estimate"][name][-1].item() == pytest.approx(expected, rel=1e-12)

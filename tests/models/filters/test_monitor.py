@@ -105,6 +105,15 @@ def test_absent_elements_are_left_as_they_are():
     assert out["chi_square_dof"].item() == 1 + 2 + 1
 
 
+def test_an_element_that_is_absent_after_its_alarm_gives_no_other():
+    flown = Flown(monitor_model("m", 2, 3, 1e-9), 1)
+    assert flown.step([[0.0], [6.0]])["alarm_element"].item() == 1
+    absent = {"residual": [[0.0], [0.0]], "sigma": [[2.0], [1.0]], "nis": 0.0, "dof": 1}
+    out = flown.step([[0.0], [0.0]], **absent)
+    assert (out["alarm_valid"].item(), out["alarms"].ravel().tolist()) == (0, [0, 1, 0])
+    assert flown.step([[0.0], [1.0]])["mean_high"].ravel().tolist() == [0.0, 0.5]
+
+
 @pytest.mark.parametrize("reason", REASONS)
 def test_what_the_gate_refused_counts_and_what_says_nothing_does_not(reason):
     flown = Flown(monitor_model("m", 1, 1, 0.01), 1)

@@ -217,6 +217,22 @@ def test_without_a_fix_and_with_a_broken_one_the_prior_stands(weights):
         np.testing.assert_allclose(P, given["P"], rtol=1e-15)
 
 
+def test_noise_that_makes_the_covariance_none_is_not_mended_by_its_weights():
+    """S = [[0.9, -1], [-1, 1.05]] is indefinite; with four times the second's noise it is not."""
+    given = {
+        "x": np.zeros(2),
+        "P": np.array([[1.0, -1.0], [-1.0, 1.0]]),
+        "R": np.diag([-0.1, 0.05]),
+    }
+    given["y"] = np.array([0.0, 4 * HUBER * np.sqrt(1.05)])
+    state = ErrorState(vector("a", 2))
+    _, _, out = corrected(state, linear(np.eye(2)), "ekf", given, "huber", HUBER)
+    assert REASONS[int(out["innovation.reason"].item())].startswith("innovation covariance not")
+    given = {"x": [0.0], "P": [[1.0]], "R": [[-0.5]], "y": [10.0]}  # S = 0.5: no scale helps
+    x, _, _ = corrected(ErrorState(vector("a", 1)), linear(np.eye(1)), "ekf", given, "nis", 1.0)
+    assert x[0] == pytest.approx(20.0)  # the plain gain, 1 / 0.5
+
+
 @ROBUST
 def test_the_gate_goes_by_the_noise_as_it_was_reported(weights):
     given = case(off=20)
