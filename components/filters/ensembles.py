@@ -33,10 +33,14 @@ class EnsembleCorrect(FilterCorrect):
     _stages: tuple[Model, list[Stage]] | None = None
 
     def build_model(self) -> Model:
-        """Build the model for the chosen update, whose predictions are inputs."""
-        name = f"{type(self).__name__.lower()}_{self.update}"
+        """Build the model for the chosen update and weights, whose predictions are inputs."""
         self._stages = staged_model(
-            name, self.error_state, self.observation, self.update, chained=True
+            self.model_name,
+            self.error_state,
+            self.observation,
+            self.update,
+            weights=self.weights,
+            chained=True,
         )
         return self._stages[0]
 

@@ -35,11 +35,16 @@ from terrafix.cosim.declare.ports import (
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.fields import Field, Unit
 from terrafix.models.core.model import Model
+from terrafix.models.filters.consistency import gate_thresholds
 from terrafix.models.filters.error_state import Block, ErrorState
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.models import correct_model, predict_model
 from terrafix.models.filters.process import Process
+from terrafix.models.filters.robust import HUBER, WEIGHTS
 from terrafix.models.filters.updates import UPDATES
+
+USUAL = 0.99
+"""Share of good fixes that weights by their NIS take as they are, unless said otherwise."""
 
 
 def value_field(block: Block) -> Field:
@@ -117,6 +122,13 @@ def _correct_ports(state: ErrorState, observation: Observation) -> dict[str, Any
             infinite=True,
             positive=True,
             doc=f"largest NIS accepted with 1 to {m} elements; infinity accepts all",
+        ),
+        "nis_threshold": Parameter(
+            gate_thresholds(USUAL, m),
+            shape=(m,),
+            infinite=True,
+            positive=True,
+            doc=f"largest NIS with 1 to {m} elements that is taken as it is",
         ),
         "prior": BundleInput(fields, doc="estimate before the fix"),
         "earlier": MessageInput(
@@ -238,6 +250,10 @@ class FilterCorrect(SymbolicComponent):
     of_ensembles: ClassVar[bool] = False
 
     update = Choice(UPDATES, "ekf", doc="how the measurement is weighed")
+    weights = Choice(WEIGHTS, "none", doc="robust: what enlarges the noise of a fix far off")
+    huber_threshold = Parameter(
+        HUBER, positive=True, infinite=True, doc="largest innovation taken as it is, in sigmas"
+    )
     underweighting = Parameter(0.0, minimum=0.0, doc="Lear's factor on H P H'")
     underweighted_updates = Parameter(0.0, minimum=0.0, doc="how many fixes it applies to")
 
@@ -253,12 +269,19 @@ class FilterCorrect(SymbolicComponent):
             declare(cls, **_correct_ports(cls.error_state, cls.observation))
         super().__init_subclass__(**options)
 
+    @property
+    def model_name(self) -> str:
+        """Of the model for the present choices."""
+        robust = "" if self.weights == "none" else f"_{self.weights}"
+        return f"{type(self).__name__.lower()}_{self.update}{robust}"
+
     def build_model(self) -> Model:
-        """Build the model for the chosen update."""
+        """Build the model for the chosen update and weights."""
         return correct_model(
-            f"{type(self).__name__.lower()}_{self.update}",
+            self.model_name,
             self.error_state,
             self.observation,
             self.update,
+            weights=self.weights,
             chained=True,
         )

@@ -142,8 +142,9 @@ def smooth_run(
     needed += [f"{correct}.estimate.{n}" for n in (*names, "P")]
     needed.append(f"{predict}.{SINCE}")
     axis = transition.dims[0]
-    for name in needed:
-        if name not in dataset or dataset[name].dims[0] != axis:
+    recorded = {name: _recorded(dataset, name, axis) for name in needed}
+    for name, variable in recorded.items():
+        if variable is None:
             raise ConfigurationError(
                 f"the run records '{predict}.{TRANSITION}', but not '{name}' at the same times\n"
                 f"  {_advice(predict, correct)}"
@@ -151,12 +152,17 @@ def smooth_run(
     times = np.asarray(dataset[axis].values, dtype=np.float64)
     prior, posterior = (
         Estimates(
-            {n: _array(dataset[f"{head}.{n}"], 1) for n in names}, _array(dataset[f"{head}.P"], 2)
+            {n: _array(recorded[f"{head}.{n}"], 1) for n in names}, _array(recorded[f"{head}.P"], 2)
         )
         for head in (f"{predict}.prior", f"{correct}.estimate")
     )
-    since = _array(dataset[f"{predict}.{SINCE}"], 1)[..., 0]
+    since = _array(recorded[f"{predict}.{SINCE}"], 1)[..., 0]
     found = smooth(state, times, prior, posterior, _array(transition, 2), since)
+    if len(times) > 1 and not np.isfinite(found.P[:-1]).any():
+        raise ConfigurationError(
+            f"the last transition counts from t = {np.nanmax(since[-1]):g} s, and the run records "
+            f"nothing then, only at {_listed(times)} s\n  {_advice(predict, correct)}"
+        )
     return _labeled(dataset, predict, correct, connections, state, times, found, posterior)
 
 
@@ -210,7 +216,20 @@ def _source(connections: Sequence[str], target: str) -> str:
     return ""
 
 
-def _array(variable: xarray.DataArray, n_axes: int) -> FloatArray:
+def _recorded(dataset: xarray.Dataset, name: str, axis: Any) -> xarray.DataArray | None:
+    """A variable on a time axis; where several records hold it, ``NAME@RECORD`` is another."""
+    for key in dataset.data_vars:
+        if str(key).partition("@")[0] == name and dataset[key].dims[0] == axis:
+            return dataset[key]
+    return None
+
+
+def _listed(times: FloatArray) -> str:
+    shown = [f"{t:g}" for t in times]
+    return ", ".join(shown if len(shown) < 6 else [*shown[:3], "...", shown[-1]])
+
+
+def _array(variable: Any, n_axes: int) -> FloatArray:
     """Values (times, members, ...)."""
     values = np.asarray(variable.values, dtype=np.float64)
     return values.reshape(*values.shape[:2], *(values.shape[2:] or (1,) * n_axes))
@@ -235,14 +254,14 @@ def _labeled(
     n = state.size
     variables: dict[str, Any] = {}
     for block in state:
-        recorded = source[f"{predict}.prior.{block.name}"]
+        recorded = source[f"{predict}.prior.{block.name}"].attrs
         variables[f"smoothed.{block.name}"] = (
             ("time", "member", f"value_{block.value_size}"),
             smoothed.values[block.name][kept],
             {
-                "units": recorded.attrs.get("units", ""),
-                "frame": recorded.attrs.get("frame", ""),
-                "unit": "rad" if block.is_rotation else recorded.attrs.get("units", ""),
+                "units": recorded.get("units", ""),
+                "frame": recorded.get("frame", ""),
+                "unit": "rad" if block.is_rotation else recorded.get("units", ""),
             },
         )
     variables["smoothed.P"] = (("time", "member", "axis", "axis_b"), smoothed.P[kept])
@@ -294,8 +313,9 @@ def _truth(
     found, missing = {}, []
     for block in state:
         port = _source(connections, f"{judge}.{block.name}")
-        if port in source and source[port].dims[0] == axis:
-            found[block.name] = _array(source[port], 1)
+        variable = _recorded(source, port, axis)
+        if variable is not None:
+            found[block.name] = _array(variable, 1)
         else:
             missing.append(port or f"{judge}.{block.name}")
     return ({}, missing) if missing else (found, [])

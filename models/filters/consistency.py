@@ -90,6 +90,6 @@ def gate_thresholds(probability: float, max_dof: int = 4) -> FloatArray:
     """
     if not 0 < probability <= 1:
         raise ValueError(f"probability must be in (0, 1], got {probability}")
-    from scipy.stats import chi2
+    from scipy.special import chdtri  # the quantiles of scipy.stats, a third of its import
 
-    return np.asarray(chi2.ppf(probability, np.arange(1, max_dof + 1)), dtype=np.float64)
+    return np.asarray(chdtri(np.arange(1, max_dof + 1), 1 - probability), dtype=np.float64)

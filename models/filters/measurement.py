@@ -19,7 +19,7 @@ import casadi as ca
 
 from terrafix.models.core.symmetric import mirrored
 from terrafix.models.filters.error_state import Block, ErrorState, Values
-from terrafix.models.filters.updates import Measurement, Update
+from terrafix.models.filters.updates import Measurement, Update, nth
 
 REASONS = (
     "accepted",
@@ -247,7 +247,7 @@ def corrected(
         )
     outcome = rule(mirrored(prior["P"]), measurement, beta, state.kept)
     dof = ca.sum1(measurement.present > 0.5)
-    threshold = sum(ca.if_else(dof == k + 1, gate[k], 0.0) for k in range(m))
+    threshold = nth(gate, dof)
     reason = ca.if_else(
         dof < 0.5,
         REASONS.index("nothing measured"),

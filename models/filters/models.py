@@ -18,6 +18,7 @@ from terrafix.models.core.symmetric import mirrored
 from terrafix.models.filters.error_state import ErrorState
 from terrafix.models.filters.measurement import Observation, corrected
 from terrafix.models.filters.process import Process, propagate
+from terrafix.models.filters.robust import THRESHOLDS, robust_rule
 from terrafix.models.filters.updates import Measurement, update_rule
 
 NEVER = -1e12
@@ -161,6 +162,7 @@ def correct_model(
     observation: Observation,
     update: str = "ekf",
     *,
+    weights: str = "none",
     underweighting: bool = True,
     chained: bool = False,
     recentered: bool = True,
@@ -176,6 +178,10 @@ def correct_model(
     observation : Observation
     update : {"ekf", "iterated", "unscented"}
         How the measurement is weighed.
+    weights : {"none", "huber", "nis"}
+        How it is made robust, see `terrafix.models.filters.robust`: take the parameter
+        ``huber_threshold`` [sigma], or ``nis_threshold`` (m,), the largest normalized innovation
+        squared with 1 to m elements that is taken as it is.
     underweighting : bool
         Take ``underweighting``, the factor applied to the first ``underweighted_updates`` fixes,
         accepted or not.
@@ -198,19 +204,23 @@ def correct_model(
         present, ``.accepted``, ``.valid``, and ``.reason``, an index into
         `terrafix.models.filters.measurement.REASONS`. Residual and sigma are zero and one for
         absent elements and without a fix; the normalized innovation squared is that of the
-        covariance without underweighting.
+        covariance without underweighting and robust weights.
 
     Raises
     ------
     ValueError
-        If the update is not known, or the observation does not fit the error state.
+        If the update or the weights are not known, or the observation does not fit the error state.
     """
-    rule = update_rule(update)
     prior, fix = state.symbols("prior"), observation.symbols("fix")
     fresh, fix_t, time = (ca.SX.sym(key) for key in ("fix_fresh", "fix_t", "time"))
     inputs = {key: ca.SX.sym(key, size) for key, size in observation.inputs.items()}
     parameters = {key: ca.SX.sym(key, size) for key, size in observation.parameters.items()}
     gate = ca.SX.sym("gate", observation.size)
+    thresholds = {}
+    if weights in THRESHOLDS:
+        size = observation.size if weights == "nis" else 1
+        thresholds = {THRESHOLDS[weights]: ca.SX.sym(THRESHOLDS[weights], size)}
+    rule = robust_rule(update_rule(update), weights, *thresholds.values())
     messages = {
         **{f"prior.{key}": symbol for key, symbol in prior.items()},
         **{f"fix.{key}": symbol for key, symbol in fix.items()},
@@ -246,7 +256,7 @@ def correct_model(
         name,
         inputs={**messages, **inputs, **observation.answers()},
         states=states,
-        parameters={**parameters, **counted, "gate": gate},
+        parameters={**parameters, **counted, **thresholds, "gate": gate},
         next={"n_updates": n_updates + arrived} if states else {},
         initial={"n_updates": ca.if_else(arrived, 1.0, 0.0)} if states else {},
         outputs={

@@ -112,10 +112,9 @@ def smooth(
     # of every member: the next time that it was smoothed at
     following = np.full(posterior.P.shape[1], last)
     for k in range(last - 1, -1, -1):
-        members = np.arange(len(following))
-        off: FloatArray = np.abs(since[following, members] - times[k])
+        off = np.abs(since[following, np.arange(len(following))] - times[k])
         who = np.flatnonzero(off <= SAME)
-        if not len(who):
+        if not who.size:
             continue
         later = following[who], who
         gain = _gain(posterior.P[k, who], transition[later], prior.P[later])
@@ -130,7 +129,7 @@ def smooth(
 def _gain(P: FloatArray, phi: FloatArray, prior: FloatArray) -> FloatArray:
     """P phi' prior^-1, (m, n, n); by the correlations, since units differ by many orders."""
     variance = np.diagonal(prior, axis1=1, axis2=2)
-    finite = np.isfinite(prior).all(axis=(1, 2))[:, None, None]
+    finite = np.isfinite(prior.sum(axis=(1, 2)))[:, None, None]
     scale = 1.0 / np.sqrt(np.where(variance > 0.0, variance, np.inf))
     correlation = np.where(finite, prior, 0.0) * scale[:, :, None] * scale[:, None, :]
     inverse = np.linalg.pinv(correlation, rcond=_CUTOFF, hermitian=True)

@@ -41,7 +41,7 @@ from terrafix.models.core.symmetric import ldl, ldl_solve, mirrored, semidefinit
 UPDATES = ("ekf", "iterated", "unscented")
 """Names of the updates."""
 
-_FLOOR = 1e-12
+FLOOR = 1e-12
 """Smallest relative pivot of an innovation covariance: correlations within 1e-12 of one fail."""
 
 _ITERATIONS = 5
@@ -137,14 +137,19 @@ class Update:
     positive: Any
 
 
+def nth(table: Any, n: Any) -> Any:
+    """Entry of a column for the number n = 1, 2, ..., in symbols; 0 for any other."""
+    return sum(ca.if_else(n == k + 1, table[k], 0.0) for k in range(ca.SX(table).shape[0]))
+
+
 def _judged(residual: Any, S: Any) -> tuple[Any, Any]:
     """Return the normalized innovation squared, and whether S is positive definite."""
-    L, d, positive = ldl(S, _FLOOR)
+    L, d, positive = ldl(S, FLOOR)
     return ca.dot(residual, ldl_solve(L, d, residual)), positive
 
 
 def _gain(P_xy: Any, S: Any, considered: Sequence[int]) -> tuple[Any, Any]:
-    L, d, positive = ldl(S, _FLOOR)
+    L, d, positive = ldl(S, FLOOR)
     K = ldl_solve(L, d, P_xy.T).T
     for k in considered:
         K[k, :] = 0

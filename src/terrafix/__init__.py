@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from terrafix import components as components
     from terrafix import filters as filters
     from terrafix import testing as testing
+    from terrafix.components.filters.smoothing import SmoothedRun as SmoothedRun
+    from terrafix.components.filters.smoothing import smooth_run as smooth_run
     from terrafix.cosim.basics.clock import Rate as Rate
     from terrafix.cosim.basics.errors import CheckpointError as CheckpointError
     from terrafix.cosim.basics.errors import ConfigurationError as ConfigurationError
@@ -110,6 +112,8 @@ _FROM = {
     "CampaignResult": "cosim.campaign.results",
     "STATISTICS": "cosim.campaign.statistics.ensemble",
     "Statistic": "cosim.campaign.statistics.statistic",
+    "smooth_run": "components.filters.smoothing",
+    "SmoothedRun": "components.filters.smoothing",
     "linear_covariance": "cosim.lincov.deviations",
     "LinearCovariance": "cosim.lincov.prediction",
     "export_fmu": "cosim.exchange.fmi.write.export",

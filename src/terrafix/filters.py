@@ -1,4 +1,4 @@
-"""What a filter of one's own is made of: an error state, a process, observations, three bases.
+"""What a filter of one's own is made of: an error state, a process, observations, four bases.
 
 ``docs/howto/a_filter_of_your_own.md`` is one from the first line to its verdict.
 """
@@ -6,6 +6,7 @@
 from terrafix.components.filters.ensembles import EnsembleCorrect as EnsembleCorrect
 from terrafix.components.filters.family import FilterCorrect as FilterCorrect
 from terrafix.components.filters.family import FilterPredict as FilterPredict
+from terrafix.components.filters.monitor import FilterMonitor as FilterMonitor
 from terrafix.components.judges.filter_evaluation import FilterEvaluation as FilterEvaluation
 from terrafix.models.filters.ensembles import EnsembleObservation as EnsembleObservation
 from terrafix.models.filters.ensembles import ensemble_observation as ensemble_observation
@@ -16,10 +17,11 @@ from terrafix.models.filters.error_state import considered as considered
 from terrafix.models.filters.error_state import rotation as rotation
 from terrafix.models.filters.error_state import vector as vector
 from terrafix.models.filters.measurement import Observation as Observation
+from terrafix.models.filters.monitor import ALARMS as ALARMS
 from terrafix.models.filters.process import Process as Process
 
 __all__ = [
-    *("Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState", "FilterCorrect"),
-    *("FilterEvaluation", "FilterPredict", "Observation", "Process", "clone", "considered"),
-    *("ensemble_observation", "rotation", "vector"),
+    *("ALARMS", "Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState", "FilterCorrect"),
+    *("FilterEvaluation", "FilterMonitor", "FilterPredict", "Observation", "Process", "clone"),
+    *("considered", "ensemble_observation", "rotation", "vector"),
 ]

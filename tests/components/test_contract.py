@@ -245,6 +245,7 @@ def _components(file: Path) -> list[str]:
     classes = [n for n in tree.body if isinstance(n, ast.ClassDef) and n.name[0] != "_"]
     bases = ("Component", "SymbolicComponent", "NoisyComponent", "Evaluation", "Playback")
     bases += ("_Echo", "_Reference")
-    bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation")  # of a filter's own classes
+    # of a filter's own classes
+    bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation", "FilterMonitor")
     derived = [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
     return [name for name in derived if name not in (*bases, "EnsembleCorrect")]

@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 
-from terrafix.cli import campaign, exchange, inspect, run
+from terrafix.cli import campaign, exchange, inspect, run, smooth
 from terrafix.cli.output import FAILED, REFUSED, print_json
 from terrafix.cosim.basics.errors import StepError, SystemCheckError, TerrafixError
 
@@ -86,7 +86,7 @@ def main() -> None:
 
 
 for _command in (
-    *(run.run, campaign.campaign, campaign.lincov, campaign.report),
+    *(run.run, smooth.smooth, campaign.campaign, campaign.lincov, campaign.report),
     *(inspect.check, inspect.graph, inspect.components),
     *(exchange.export_fmu_command, exchange.check_fmu_command, exchange.ssp),
 ):

@@ -130,10 +130,12 @@ def system(correct):
     return made
 
 
+@pytest.mark.parametrize("weights", ["none", "huber", "nis"])
 @pytest.mark.parametrize("update", ["ekf", "iterated", "unscented"])
-def test_a_function_of_ensembles_corrects_as_its_expression_does(update):
+def test_a_function_of_ensembles_corrects_as_its_expression_does(update, weights):
     """Members with a fix and without, elements absent, angles, a rotation, a considered block."""
     settings = {"update": update, "underweighting": 0.3, "underweighted_updates": 4.0}
+    settings |= {"weights": weights}
     found = [tf.simulate(system(kind(**settings)), members=7).dataset for kind in (Plain, Whole)]
     assert float(found[0]["judge.nees"][-1].mean()) < 20  # of 7: it follows the truth
     for name in ("r_error", "q_error", "covariance", "normalized_innovation", "nis", "reason"):

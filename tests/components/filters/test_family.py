@@ -14,6 +14,7 @@ from terrafix.models.core.model import Model
 from terrafix.models.filters.error_state import ErrorState, clone, vector
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.process import Process
+from terrafix.models.filters.robust import WEIGHTS
 
 STATE = ErrorState(vector("r", 1, unit="m"), vector("v", 1, unit="m/s"))
 PROCESS = Process(
@@ -200,8 +201,12 @@ def test_the_covariance_is_the_textbook_s_and_the_errors_are_of_its_size(second)
     assert low - 0.02 < result.evaluation["nis"]["mean"] < high + 0.02
 
 
-def test_linear_covariance_takes_it_without_knowing_which():
-    found = linear_covariance(tracker())
+@pytest.mark.parametrize("weights", WEIGHTS)
+def test_linear_covariance_takes_it_without_knowing_which(weights):
+    """Robust weights are one where nothing is off, which is where it is linear."""
+    system = tracker()
+    system.find("correct").weights = weights
+    found = linear_covariance(system)
     np.testing.assert_allclose(found.total[-1], kalman(60), rtol=1e-9)
     np.testing.assert_allclose(found.filter[-1], kalman(60), rtol=1e-9)
     assert [label.strip() for label in found.labels] == ["r", "v"]
