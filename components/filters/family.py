@@ -164,6 +164,24 @@ def transition_ports(state: ErrorState) -> tuple[Output, Output]:
     )
 
 
+def check_start(component: SymbolicComponent) -> None:
+    """Fail members whose start message has a covariance that is none."""
+    P = np.asarray(component.port_views["start"].P)
+    given = component.environment.active & np.isfinite(P).all(axis=(1, 2))
+    P = np.where(given[:, None, None], P, np.eye(P.shape[1]))
+    variance = np.diagonal(P, axis1=1, axis2=2)
+    scale = 1.0 / np.sqrt(np.where(variance > 0.0, np.abs(variance), 1.0))
+    P = P * scale[:, :, None] * scale[:, None, :]
+    off = np.abs(P - P.transpose(0, 2, 1)).max(axis=(1, 2)) > _NEARLY
+    component.fail(off, "the covariance in 'start' is not symmetric")
+    least = np.linalg.eigvalsh((P + P.transpose(0, 2, 1)) / 2)[:, 0]
+    bad = ~off & ((variance < 0.0).any(axis=1) | (least < -_NEARLY))
+    component.fail(bad, "the covariance in 'start' is not positive definite")
+
+
+_NEARLY = 1e-9
+"""Of a correlation matrix, what rounding may make of zero."""
+
 TRANSITION, SINCE = "error_transition", "transition_since"
 TRANSITION_OF = "of the error of "
 """How the description of a transition's port begins; the error state's text follows."""
@@ -214,6 +232,11 @@ class FilterPredict(SymbolicComponent):
                 )
             declare(cls, **ports)
         super().__init_subclass__(**options)
+
+    def _initialize_impl(self) -> None:
+        super()._initialize_impl()
+        if self.told:
+            check_start(self)
 
     @property
     def _sigmas(self) -> dict[str, str]:

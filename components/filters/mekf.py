@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from terrafix.components.fields import ESTIMATE, FIX, INNOVATION, KNOWN_STATE
-from terrafix.components.filters.family import transition_ports
+from terrafix.components.filters.family import check_start, transition_ports
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import (
@@ -60,6 +60,10 @@ class MekfPredict(SymbolicComponent):
     delta_v_b = Input((3,), unit="m/s", frame="b", doc="measured velocity increment")
     q_be = Input((4,), unit="1", frame="b", doc="measured attitude, Earth-fixed to body")
     prior = BundleOutput(ESTIMATE, doc="estimate before any fix of this instant")
+
+    def _initialize_impl(self) -> None:
+        super()._initialize_impl()
+        check_start(self)
 
     def build_model(self) -> Model:
         """Build the model for the chosen gravity and transition."""

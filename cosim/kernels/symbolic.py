@@ -117,7 +117,12 @@ class SymbolicComponent(Component):
             if not isinstance(s, Parameter)
         )
         if self._model is None or self._model[0] != structure:
-            self._model = (structure, self.build_model())
+            try:
+                self._model = (structure, self.build_model())
+            except ValueError as error:
+                raise ConfigurationError(
+                    f"{type(self).__name__} cannot build its model: {error}"
+                ) from error
         return self._model[1]
 
     _model: tuple[Any, SymbolicModel] | None = None

@@ -148,7 +148,7 @@ def vector(
     return Block(name, size, unit, frame, tuple(labels))
 
 
-def rotation(name: str, *, side: str, frame: str | None = None) -> Block:
+def rotation(name: str, *, side: str = "", frame: str | None = None) -> Block:
     """A block that is a unit quaternion; its error is a rotation vector [rad].
 
     Raises
@@ -157,9 +157,10 @@ def rotation(name: str, *, side: str, frame: str | None = None) -> Block:
         If the side is neither of `SIDES`.
     """
     if side not in SIDES:
+        said = f"is on the side '{side}'" if side else "has no side"
         raise ValueError(
-            f"the error of rotation '{name}' is on the side '{side}'; it is on the left (in the "
-            "axes it leads to) or on the right (in those it comes from)"
+            f"the error of rotation '{name}' {said}; it is on the left (in the axes it leads to) "
+            'or on the right (in those it comes from): say side="left" or side="right"'
         )
     return Block(name, 3, "rad", frame, side=side)
 

@@ -220,9 +220,15 @@ def _rates(
         if rate.shape != (sizes[name], 1):
             raise ValueError(
                 f"a process moves '{name}' by a rate of shape {rate.shape}; its error has "
-                f"{sizes[name]} elements"
+                f"{sizes[name]} elements{_sizes_of(process)}"
             )
     return found
+
+
+def _sizes_of(process: Process) -> str:
+    """Sizes of its noise, as the end of a sentence: one may be what makes a rate too long."""
+    noise = ", ".join(f"'{name}' {size}" for name, (_, size) in process.noise.items())
+    return f" (its noise has: {noise})" if noise else ""
 
 
 def _quiet(process: Process) -> dict[str, Any]:

@@ -76,6 +76,7 @@ SETTINGS = {
     },
     "mekf_correct": {"look": 0.6},
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
+    "mekf_predict_smoothed": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "orbit": {"r0_i": R_E, "v0_i": [-560.1, 3729.6, 6497.9]},
     "synthetic_sar_fix": {"look": 0.6},
 }
@@ -247,5 +248,7 @@ def _components(file: Path) -> list[str]:
     bases += ("_Echo", "_Reference")
     # of a filter's own classes
     bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation", "FilterMonitor")
+    abstract = (*bases, "EnsembleCorrect")
+    bases += ("MekfPredict",)
     derived = [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
-    return [name for name in derived if name not in (*bases, "EnsembleCorrect")]
+    return [name for name in derived if name not in abstract]

@@ -405,3 +405,103 @@ def test_a_late_measurement_without_a_clone_is_refused():
     hopeful = Hopeful()
     with pytest.raises(ValueError, match=r"'center', of which there is no clone; .* none"):
         hopeful.build_model()
+
+
+# ----------------------------------------------------------------------------- bad input
+
+
+def refused(filter_class):
+    """What the check of a system with a filter part says."""
+    system = tracker()
+    system.replace(
+        "predict" if issubclass(filter_class, FilterPredict) else "correct", filter_class()
+    )
+    with pytest.raises(tf.SystemCheckError) as told:
+        system.check()
+    return str(told.value)
+
+
+def test_a_measurement_of_a_block_that_is_none_is_refused_before_the_run():
+    class Wrong(FilterCorrect):
+        default_rate = tf.Rate("1", offset="1")
+        error_state, observation = STATE, Observation(lambda x, _: x["w"], {"range": "m"})
+
+    assert "Wrong cannot build its model: there is no block 'w'; the blocks are r, v" in refused(
+        Wrong
+    )
+
+
+def test_noise_of_another_size_is_refused_before_the_run():
+    class Wrong(TrackerPredict):
+        error_state = STATE
+        process = Process(
+            rates=lambda x, _, w, __: {"r": x["v"], "v": w["a"]}, noise={"a": ("accel_psd", 3)}
+        )
+
+    said = refused(Wrong)
+    assert "moves 'v' by a rate of shape (3, 1); its error has 1 elements" in said
+    assert "(its noise has: 'a' 3)" in said
+
+
+def test_two_chains_cannot_feed_one_predict():
+    system = tracker(chain=True)
+    with pytest.raises(tf.WiringError, match=r"'predict.posterior' has two drivers\n  'second"):
+        system.connect(system.find("correct")["posterior"], system.find("predict")["posterior"])
+
+
+def test_a_gate_has_as_many_elements_as_the_measurement():
+    with pytest.raises(tf.ConfigurationError, match=r"'gate' has shape \(2,\); it takes .* \(1,\)"):
+        RangeCorrect(gate=[1.0, 2.0])
+
+
+class Told(TrackerPredict):
+    """Told where it starts."""
+
+    error_state, process, told = STATE, PROCESS, ("r", "v")
+
+
+class Start(tf.Component):
+    """Tells members of one covariance each."""
+
+    default_rate = tf.Rate(times=["0"])
+    state = tf.MessageOutput(fields=Told.declarations["start"].fields)
+    P: tuple = ()
+
+    @property
+    def publishes_at_start(self):
+        return True
+
+    def _initialize_impl(self):
+        self.state.publish(0.0, r=[0.0], v=[0.0], P=np.array(self.P))
+
+    def _step_impl(self, t, dt):
+        pass
+
+
+def test_a_covariance_that_is_none_at_the_start_fails_that_member_alone():
+    """A correlation of 5, a variance of -1, an asymmetry; a singular one and zero are fine."""
+    sound, wrong = [[4.0, 1.0], [1.0, 1.0]], [[1.0, 5.0], [5.0, 1.0]]
+    singular, zero = [[4.0, 2.0], [2.0, 1.0]], np.zeros((2, 2))
+    negative, crooked = [[-1.0, 0.0], [0.0, 1.0]], [[4.0, 1.0], [0.5, 1.0]]
+    system = tracker(predict=Told())
+    start = system.add(Start(), "start")
+    start.P = (sound, wrong, singular, zero, negative, crooked)
+    system.connect(start["state"], system.find("predict")["start"])
+    result = tf.simulate(system, members=6, duration="5")
+    assert {e["member"]: e["reason"] for e in result.excluded} == {
+        1: "the covariance in 'start' is not positive definite",
+        4: "the covariance in 'start' is not positive definite",
+        5: "the covariance in 'start' is not symmetric",
+    }
+    assert {e["component"] for e in result.excluded} == {"predict"}
+
+
+def test_a_clone_that_was_not_made_yet_or_is_too_old_says_why():
+    """Made at 20.5 s alone: of 30 fixes, each of half a second ago, the 21st is of that instant."""
+    system = late(waits=True)
+    system.replace("mark", Mark(rate=tf.Rate(times=["20.5"])))
+    fixes = tf.simulate(system).evaluation["fixes"]
+    accepted = [fix["t_s"] for fix in fixes if fix["reason"] == "accepted"]
+    assert accepted == [21.0]
+    assert {fix["reason"] for fix in fixes} == {"accepted", "not of this instant"}
+    assert len(fixes) == 30

@@ -107,7 +107,7 @@ def test_a_covariance_follows_the_corrected_estimate(side):
         (lambda: ErrorState(), "one block or more"),
         (lambda: ErrorState(vector("a"), vector("a")), "two things .* are called 'a'"),
         (lambda: ErrorState(vector("P")), "called 'P'"),
-        (lambda: rotation("q", side=""), "on the side ''; it is on the left .* or on the right"),
+        (lambda: rotation("q", side=""), "has no side; it is on the left .* or on the right"),
         (lambda: vector("1st"), "'1st' cannot name a block"),
         (lambda: vector("a", 0), "has size 0"),
         (lambda: vector("a", 2, labels=("x",)), "1 labels for 2 elements"),
