@@ -20,6 +20,7 @@ the last one's posterior goes to `predict`. They step at one rate, their fixes c
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -66,6 +67,22 @@ def estimate_fields(state: ErrorState) -> dict[str, Field]:
     )
     times = {f"t_{i}": Field((1,), "s", doc="of its clones") for i in state.instants}
     return {block.name: value_field(block) for block in state} | times | {"P": P}
+
+
+def start_fields(state: ErrorState, told: Collection[str]) -> dict[str, Field]:
+    """Fields of a message that tells where blocks start."""
+    blocks = [block for block in state if block.name in told]
+    size = sum(block.size for block in blocks)
+    P = Field((size, size), "1", doc="covariance of their error")
+    return {block.name: value_field(block) for block in blocks} | {"P": P}
+
+
+def starting_sigmas(
+    state: ErrorState, told: Collection[str], named: Mapping[str, str]
+) -> dict[str, str]:
+    """Parameters that hold the sigma of blocks that are not told: ``NAME_sigma0``, or as named."""
+    usual = {b.name: f"{b.name}_sigma0" for b in state if b.name not in told and not b.clone_of}
+    return usual | dict(named)
 
 
 def fix_fields(observation: Observation) -> dict[str, Field]:
@@ -223,12 +240,10 @@ class FilterPredict(SymbolicComponent):
                     fields={"index": Field((), "1")}, at="start", doc="makes its clones anew"
                 )
             if cls.told:
-                told = [block for block in state if block.name in cls.told]
-                size = sum(block.size for block in told)
-                start = {block.name: value_field(block) for block in told}
-                start["P"] = Field((size, size), "1", doc="covariance of their error")
                 ports["start"] = MessageInput(
-                    fields=start, needed_at_start=True, doc="last known state, at t = 0"
+                    fields=start_fields(state, cls.told),
+                    needed_at_start=True,
+                    doc="last known state, at t = 0",
                 )
             declare(cls, **ports)
         super().__init_subclass__(**options)
@@ -238,15 +253,6 @@ class FilterPredict(SymbolicComponent):
         if self.told:
             check_start(self)
 
-    @property
-    def _sigmas(self) -> dict[str, str]:
-        given = {
-            b.name: f"{b.name}_sigma0"
-            for b in self.error_state
-            if b.name not in self.told and not b.clone_of
-        }
-        return given | self.sigmas
-
     def build_model(self) -> Model:
         """Build the model of the process."""
         return predict_model(
@@ -254,7 +260,7 @@ class FilterPredict(SymbolicComponent):
             self.error_state,
             self.process,
             told=self.told,
-            sigmas=self._sigmas,
+            sigmas=starting_sigmas(self.error_state, self.told, self.sigmas),
             smoothed=self.smoothed,
         )
 

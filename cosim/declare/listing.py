@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -33,7 +34,7 @@ def type_content(name: str) -> dict[str, Any]:
     ConfigurationError
         If there is no such type, or it cannot be imported.
     """
-    kind = component_type(name)
+    kind = component_type(name, Path())
     ports = {n: p for n, p in kind.declarations.items() if isinstance(p, Port)}
     return {
         "type": name,

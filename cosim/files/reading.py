@@ -225,7 +225,7 @@ def _component(
         load.broken.add(name)
         return
     try:
-        made = component_type(kind)()
+        made = component_type(kind, load.folder)()
     except TerrafixError as error:
         load.problems.append(type(error)(f"'{name}': {error}"))
         load.broken.add(name)

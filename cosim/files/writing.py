@@ -11,7 +11,7 @@ from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import PATHS
-from terrafix.cosim.declare.registry import component_entries
+from terrafix.cosim.declare.registry import component_entries, own_type
 from terrafix.cosim.files.reading import SCHEMA
 from terrafix.cosim.system.dispersion import KINDS
 from terrafix.cosim.system.system import System
@@ -135,12 +135,14 @@ def _names(components: Iterable[str]) -> dict[str, str]:
 def _component(path: str, component: Component, types: Mapping[str, str]) -> dict[str, Any]:
     """Type, times and what was set of one component."""
     kind = f"{type(component).__module__}:{type(component).__qualname__}"
-    if kind not in types:
+    known = types.get(kind) or own_type(type(component))
+    if known is None:
         raise ConfigurationError(
             f"'{path}' is a {type(component).__name__}, which is no registered component type\n"
-            "  register it in the entry-point group terrafix.components"
+            "  register it in the entry-point group terrafix.components, or read it from a file as "
+            "MODULE:CLASS"
         )
-    table = {"type": types[kind]} | _doc(component.doc) | _timing(component.rate)
+    table = {"type": known} | _doc(component.doc) | _timing(component.rate)
     for name, setting in component.settings().items():
         value = component.setting(name) if name in component.given_parameters else None
         if value is not None:

@@ -1,20 +1,25 @@
-r"""The two models that every filter is: predict, and correct, made of what it estimates.
+r"""The two models that every filter is: predict, and correct, made of what it estimates; its twins.
 
 `predict_model` keeps the estimate, moves it by the process, and begins anew where a posterior
 comes; `correct_model` weighs a prior against a fix. Late in a chain of corrections a model is told
 by `earlier` that the estimate it reads was corrected before it, so that its own is the posterior
 even where it has no fix.
+
+The twins are what a filter believes, made true: `truth_model` draws a start and the noise of the
+process, `sensor_model` measures as an observation says. Against them a filter is consistent, or not
+made right.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from math import pi
 from typing import Any
 
 import casadi as ca
 
 from terrafix.models.core.model import Model
-from terrafix.models.core.symmetric import mirrored
+from terrafix.models.core.symmetric import mirrored, semidefinite_root
 from terrafix.models.filters.error_state import ErrorState
 from terrafix.models.filters.measurement import Observation, corrected
 from terrafix.models.filters.process import Process, propagate
@@ -272,4 +277,103 @@ def correct_model(
             "innovation.reason": outcome.reason,
         },
         time=time,
+    )
+
+
+def truth_model(
+    name: str,
+    state: ErrorState,
+    process: Process,
+    *,
+    told: Sequence[str],
+    sigmas: Mapping[str, str],
+) -> Model:
+    """A truth that is what a filter of these believes: its start, and noise as it moves, drawn.
+
+    Parameters are those of `predict_model`. The start of a block that is told is drawn about it.
+
+    Returns
+    -------
+    Model
+        Inputs of the process; for the start alone ``start.*``. Outputs by block, without clones.
+    """
+    present = state.present
+    inputs = {key: ca.SX.sym(key, size) for key, size in process.inputs.items()}
+    parameters = {key: ca.SX.sym(key, size) for key, size in process.named().items()}
+    values = {b.name: ca.SX.sym(f"own_{b.name}", b.value_size) for b in present}
+    step, time = ca.SX.sym("dt"), ca.SX.sym("time")
+    first, noise = (ca.SX.sym(key, present.size) for key in ("first", "noise"))
+    moved = propagate(present, process, values, {**inputs, **parameters}, step, time)
+    end = present.retract(moved.values, ca.mtimes(semidefinite_root(moved.spread), noise))
+    sigma = {key: parameters.get(key, ca.SX.sym(key)) for key in sigmas.values()}
+    start, initial = _start(present, told, {block: sigma[key] for block, key in sigmas.items()})
+    begin = present.retract(initial, ca.mtimes(semidefinite_root(initial["P"]), first))
+    following = present.normalized(end)
+    free = ca.symvar(ca.vertcat(*following.values()))
+    uses_time = time.element_hash() in {element.element_hash() for element in free}
+    return Model(
+        name,
+        inputs={**inputs, **start},
+        states=values,
+        parameters={**parameters, **sigma},
+        noise={"first": first, "noise": noise},
+        next=following,
+        initial=present.normalized(begin),
+        outputs=values,
+        step=step,
+        time=time if uses_time else None,
+    )
+
+
+def sensor_model(name: str, state: ErrorState, observation: Observation) -> Model:
+    """A sensor that measures what an observation says, with white noise, and reports it.
+
+    Returns
+    -------
+    Model
+        Inputs: the true values of blocks, the observation's inputs, and the fields of its message.
+        Parameters ``sigma`` (m,), and those of the observation. Output ``fix.*``.
+
+    Raises
+    ------
+    ValueError
+        If the observation is of an instant that is past, or maps the error of a field.
+    """
+    if observation.instant or observation.mapped or observation.of_ensembles:
+        what = (
+            f"is of the instant '{observation.instant}'"
+            if observation.instant
+            else "maps the error of a field"
+            if observation.mapped
+            else "is a function of ensembles"
+        )
+        raise ValueError(
+            f"the observation of sensor '{name}' {what}: such a sensor is a component of its own"
+        )
+    values = {b.name: ca.SX.sym(b.name, b.value_size) for b in state.present}
+    sizes = {b.name: b.size for b in observation.fields} | dict(observation.inputs)
+    inputs = {key: ca.SX.sym(key, size) for key, size in sizes.items()}
+    parameters = {key: ca.SX.sym(key, size) for key, size in observation.parameters.items()}
+    sigma, noise = (ca.SX.sym(key, observation.size) for key in ("sigma", "noise"))
+    y = ca.SX(observation.predict(values, {**inputs, **parameters})) + sigma * noise
+    for k in observation.angular:
+        y[k] -= 2 * pi * ca.floor((y[k] + pi) / (2 * pi))
+    free = {e.element_hash() for e in ca.symvar(y)}
+    used = {
+        k: s
+        for k, s in values.items()
+        if any(s[i].element_hash() in free for i in range(s.numel()))
+    }
+    return Model(
+        name,
+        inputs={**used, **inputs},
+        parameters={**parameters, "sigma": sigma},
+        noise={"noise": noise},
+        outputs={
+            "fix.y": y,
+            **{f"fix.{b.name}": inputs[b.name] for b in observation.fields},
+            "fix.R": ca.densify(ca.diag(sigma**2)),
+            "fix.present": ca.SX.ones(observation.size),
+            "fix.valid": ca.SX(1),
+        },
     )

@@ -7,6 +7,8 @@ from terrafix.components.filters.ensembles import EnsembleCorrect as EnsembleCor
 from terrafix.components.filters.family import FilterCorrect as FilterCorrect
 from terrafix.components.filters.family import FilterPredict as FilterPredict
 from terrafix.components.filters.monitor import FilterMonitor as FilterMonitor
+from terrafix.components.filters.twins import FilterSensor as FilterSensor
+from terrafix.components.filters.twins import FilterTruth as FilterTruth
 from terrafix.components.judges.filter_evaluation import FilterEvaluation as FilterEvaluation
 from terrafix.models.filters.ensembles import EnsembleObservation as EnsembleObservation
 from terrafix.models.filters.ensembles import ensemble_observation as ensemble_observation
@@ -22,6 +24,7 @@ from terrafix.models.filters.process import Process as Process
 
 __all__ = [
     *("ALARMS", "Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState", "FilterCorrect"),
-    *("FilterEvaluation", "FilterMonitor", "FilterPredict", "Observation", "Process", "clone"),
-    *("considered", "ensemble_observation", "rotation", "vector"),
+    *("FilterEvaluation", "FilterMonitor", "FilterPredict", "FilterSensor", "FilterTruth"),
+    *("Observation", "Process", "clone", "considered", "ensemble_observation", "rotation"),
+    "vector",
 ]
