@@ -18,10 +18,31 @@ def code_of(page: str) -> str:
     return "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
 
 
+def files_of(page: str) -> dict[str, str]:
+    """Files that a page says are there, by name."""
+    text = (HOWTO / f"{page}.md").read_text()
+    return dict(re.findall(r"```(?:python|toml) (\S+)\n(.*?)```", text, re.DOTALL))
+
+
 @pytest.mark.parametrize("page", ["add_a_sensor", "add_a_filter", "a_filter_of_your_own"])
 def test_the_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    exec(compile(code_of(page), f"{page}.md", "exec"), {"__name__": page})
+    for name, text in files_of(page).items():
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    try:
+        exec(compile(code_of(page), f"{page}.md", "exec"), {"__name__": page})
+    finally:
+        for name in files_of(page):
+            sys.modules.pop(Path(name).stem, None)
+
+
+def test_a_filter_of_your_own_is_short():
+    """Filter, truth, wiring and verdict: under 60 lines that are not empty."""
+    page = "a_filter_of_your_own"
+    verdict = code_of(page).partition("class Strays")[0]
+    lines = [*files_of(page).values(), verdict]
+    assert sum(1 for text in lines for line in text.splitlines() if line.strip()) < 60
 
 
 def test_a_file_format_is_found_by_its_suffix(tmp_path):

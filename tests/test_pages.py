@@ -14,7 +14,7 @@ EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative
 
 
 def blocks(page: Path) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    return re.findall(r"```python(?: \S+)?\n(.*?)```", page.read_text(), re.DOTALL)
 
 
 @EVERY_PAGE

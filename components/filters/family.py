@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -122,11 +123,25 @@ def innovation_fields(observation: Observation) -> dict[str, Field]:
 
 
 def declare(cls: type, **ports: Any) -> None:
-    """Declare on a class what it does not declare itself."""
+    """Declare on a class what neither it nor a class mixed into it declares itself."""
+    own = [c for c in cls.__mro__ if c is cls or not issubclass(c, Component)]
     for name, port in ports.items():
-        if name not in vars(cls):
+        if not any(name in vars(c) for c in own):
             setattr(cls, name, port)
             port.__set_name__(cls, name)
+
+
+def says(cls: type, *names: str) -> bool:
+    """Whether a class says all of `names`, and at least one of them otherwise than its bases.
+
+    Its ports follow from them; what a base of the family said has been followed there.
+    """
+    if not all(hasattr(cls, name) for name in names):
+        return False
+    said = tuple(getattr(cls, name) for name in names)
+    before = getattr(cls, "_said", None)
+    cls._said = said  # type: ignore[attr-defined]
+    return before is None or any(a is not b for a, b in zip(said, before, strict=True))
 
 
 def _correct_ports(state: ErrorState, observation: Observation) -> dict[str, Any]:
@@ -225,10 +240,10 @@ class FilterPredict(SymbolicComponent):
     smoothed: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
-        if cls.smoothed and hasattr(cls, "error_state"):
-            transition, since = transition_ports(cls.error_state)
-            declare(cls, **{TRANSITION: transition, SINCE: since})
-        if "error_state" in vars(cls):
+        if says(cls, "error_state", "told", "smoothed"):
+            if cls.smoothed:
+                transition, since = transition_ports(cls.error_state)
+                declare(cls, **{TRANSITION: transition, SINCE: since})
             state = cls.error_state
             fields = estimate_fields(state)
             ports: dict[str, Any] = {
@@ -287,7 +302,7 @@ class FilterCorrect(SymbolicComponent):
     underweighted_updates = Parameter(0.0, minimum=0.0, doc="how many fixes it applies to")
 
     def __init_subclass__(cls, **options: Any) -> None:
-        if "error_state" in vars(cls):
+        if says(cls, "error_state", "observation"):
             if cls.observation.of_ensembles != cls.of_ensembles:
                 kind = "a function of ensembles" if cls.observation.of_ensembles else "symbolic"
                 base = "EnsembleCorrect" if cls.observation.of_ensembles else "FilterCorrect"

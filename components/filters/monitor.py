@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from terrafix.components.filters.family import declare, innovation_fields
+from terrafix.components.filters.family import declare, innovation_fields, says
 from terrafix.cosim.declare.parameters import Count, Parameter
 from terrafix.cosim.declare.ports import MessageInput, MessageOutput, Output
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
@@ -58,7 +58,7 @@ class FilterMonitor(SymbolicComponent):
     alarms = Output((len(ALARMS),), labels=ALARMS, doc="how often each test gave one")
 
     def __init_subclass__(cls, **options: Any) -> None:
-        if "observation" in vars(cls):
+        if says(cls, "observation"):
             shape, labels = (cls.observation.size,), tuple(cls.observation.elements)
             fields = innovation_fields(cls.observation)
             declare(

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 from terrafix.components.filters.family import (
     declare,
     fix_fields,
+    says,
     start_fields,
     starting_sigmas,
     value_field,
@@ -41,7 +42,7 @@ class FilterTruth(NoisyComponent):
     sigmas: ClassVar[dict[str, str]] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
-        if "error_state" in vars(cls):
+        if says(cls, "error_state", "told"):
             state, ports = cls.error_state.present, dict[str, Any]()
             for block in state:
                 field = value_field(block)
@@ -84,7 +85,7 @@ class FilterSensor(NoisyComponent):
     observation: ClassVar[Observation]
 
     def __init_subclass__(cls, **options: Any) -> None:
-        if "error_state" in vars(cls):
+        if says(cls, "error_state", "observation"):
             seen = cls.observation
             units = tuple(seen.elements.values())
             model = sensor_model(cls.__name__.lower(), cls.error_state, seen)

@@ -12,6 +12,7 @@ from terrafix.components.filters.family import (
     declare,
     estimate_fields,
     innovation_fields,
+    says,
     value_field,
 )
 from terrafix.cosim.basics.arrays import FloatArray
@@ -60,7 +61,7 @@ class FilterEvaluation(Evaluation):
     reason = Output(doc="index into terrafix.models.filters.measurement.REASONS, of the last")
 
     def __init_subclass__(cls, **options: Any) -> None:
-        if "error_state" in vars(cls):
+        if says(cls, "error_state", "observation", "observations", "judged", "called"):
             state, ports = cls.error_state.present, dict[str, Any]()
             _check(cls)
             for block in state:

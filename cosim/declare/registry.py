@@ -75,7 +75,8 @@ def _is_component(found: object) -> bool:
 def _own(name: str, folder: Path | None) -> type[Component]:
     """A class by its module and name."""
     module, _, kind = name.partition(":")
-    if not all(part.isidentifier() for part in (*module.split("."), kind)):
+    parts = (*module.split("."), kind)
+    if module.endswith(".py") or not all(part.isidentifier() for part in parts):
         raise ConfigurationError(
             f"component type '{name}' is neither a registered name nor MODULE:CLASS\n"
             "  write the module without .py, and its class, as in 'tracker:Predict'"
