@@ -9,7 +9,7 @@ from terrafix.models.filters.error_state import SIDES, ErrorState, rotation, vec
 from terrafix.models.filters.process import Process, propagate
 from terrafix.models.filters.spacecraft import STATE, spacecraft_process
 from terrafix.models.geometry.earth import EARTH
-from terrafix.models.geometry.quaternion import from_rotation_vector, product
+from terrafix.models.geometry.quaternion import from_rotation_vector, product, rotation_matrix
 
 
 class Propagated:
@@ -127,6 +127,36 @@ def test_a_turn_at_a_constant_rate_is_exact_on_either_side(side):
     numeric = step.by_differences({"q": q, "bias": bias}, given, 0.1, np.full(6, 1e-5))
     np.testing.assert_allclose(phi, numeric, atol=1e-9)
     np.testing.assert_allclose(np.diag(Q), [2e-5] * 3 + [1e-7] * 3, rtol=1e-12)
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("trial", range(10))
+def test_a_derived_transition_is_the_difference_of_steps_at_random_states(side, trial):
+    """Of a thrust along axes that turn, a pull, a drag and a bias of the rate: to 1e-6."""
+    rng = np.random.default_rng(trial)
+    state = ErrorState(vector("r"), vector("v"), rotation("q", side=side), vector("bias"))
+
+    def rates(x, given, _, t):
+        thrust = rotation_matrix(x["q"]).T @ given["thrust"]
+        pull = -x["r"] / ca.norm_2(x["r"]) ** 3
+        drag = -0.1 * ca.norm_2(x["v"]) * x["v"]
+        return {"r": x["v"], "v": pull + drag + thrust, "q": given["rate"] - x["bias"]}
+
+    process = Process(
+        rates=rates, decays={"bias": ("tau", "sigma")}, inputs={"thrust": 3, "rate": 3}
+    )
+    step = Propagated(state, process)
+    values = {n: rng.normal(size=3) for n in ("r", "v", "bias")}
+    values["r"] *= 2 / np.linalg.norm(values["r"])
+    q = rng.normal(size=4)
+    values = {"r": values["r"], "v": values["v"], "q": q / np.linalg.norm(q)} | {
+        "bias": values["bias"]
+    }
+    given = {"thrust": rng.normal(size=3), "rate": 2 * rng.normal(size=3), "tau": 3.0, "sigma": 1.0}
+    phi = step(values, given, 0.3)[1]
+    numeric = step.by_differences(values, given, 0.3, np.full(12, 1e-5))
+    np.testing.assert_allclose(phi, numeric, rtol=1e-6, atol=1e-6 * np.abs(phi).max())
+    assert np.abs(phi[3:6, 6:9]).max() > 0.05  # the thrust turns with the axes
 
 
 @pytest.mark.parametrize("side", SIDES)
