@@ -48,6 +48,8 @@ benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/fmu.py
 	$(BIN)/python benchmarks/imaging.py
 	$(BIN)/python benchmarks/closed_loop.py
+	$(BIN)/python benchmarks/filters.py
+	$(BIN)/python benchmarks/verdicts.py
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
 	    then $(BIN)/python benchmarks/real_echo.py; fi
 

@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import terrafix as tf
 from terrafix.components.filters.family import FilterCorrect, FilterPredict
@@ -350,14 +351,14 @@ class Held(tf.Component):
         )
 
 
-def late(*, waits, shift="0 s"):
+def late(*, waits, shift="0 s", predict=None):
     """Ranges of half a second ago: by a clone, or with a filter that has them at once."""
     with tf.System("late", duration="30", seed=5) as system:
         truth = system.add(Truth(), "truth")
         ranger = system.add(RangeSensor(rate=tf.Rate("1", offset="0.5")), "ranger")
         system.connect(truth["r"], ranger["x"])
         if waits:
-            predict = system.add(LatePredict(), "predict")
+            predict = system.add(predict or LatePredict(), "predict")
             correct = system.add(LateCorrect(), "correct")
             judge = system.add(LateEvaluation(), "judge")
             held, mark = system.add(Held(shift=shift), "held"), system.add(Mark(), "mark")
@@ -387,6 +388,39 @@ def test_a_clone_equals_the_filter_that_had_the_measurement_in_time():
             for d in (cloned, timely)
         )
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+class SmoothedPredict(LatePredict):
+    """With its transition."""
+
+    smoothed = True
+
+
+def test_a_filter_with_a_clone_is_smoothed_and_consistent():
+    """Of position and speed, two of three elements: means of 200 in their 99.9 % intervals."""
+    system = late(waits=True, predict=SmoothedPredict())
+    predict = system.find("predict")
+    ports = [predict[n] for n in ("error_transition", "transition_since", "prior")]
+    system.record("smoother", [*ports, system.find("correct")["estimate"]], period="1")
+    result = tf.simulate(system, members=200)
+    found = tf.smooth_run(result).dataset
+    assert found.sizes["time"] == 31
+    low, high = chi2.ppf([0.0005, 0.9995], 2 * 200) / 200
+    record = tf.smooth_run(result)
+    P = record.dataset["smoothed.P"].values[:, :, :2, :2]
+    truth = {n: result.dataset[f"judge.{n}_error"].values for n in ("r", "v")}
+    for k in (1, 10, 20, 29):
+        error = np.concatenate(
+            [
+                record.dataset[f"smoothed.{n}"].values[k]
+                - (result.dataset[f"correct.estimate.{n}"].values[k] - truth[n][k])
+                for n in ("r", "v")
+            ],
+            axis=1,
+        )
+        nees = np.einsum("mi,mij,mj->m", error, np.linalg.inv(P[k]), error)
+        assert low < nees.mean() < high, (k, nees.mean())
+    assert (found["smoothed.sigma"].values[10] < 0.8 * found["filter.sigma"].values[10]).all()
 
 
 def test_a_late_measurement_of_another_instant_is_not_taken():
