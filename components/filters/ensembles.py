@@ -15,6 +15,7 @@ from terrafix.cosim.declare.component import Environment
 from terrafix.cosim.declare.ports import Capabilities
 from terrafix.models.core.model import Model
 from terrafix.models.filters.ensembles import ANSWER, EnsembleObservation, Stage, staged_model
+from terrafix.models.filters.measurement import TIME
 
 
 class EnsembleCorrect(FilterCorrect):
@@ -113,6 +114,7 @@ class EnsembleCorrect(FilterCorrect):
         given = {n: self.port_views[n][who] for n in seen.inputs}
         given |= {n: self.parameter_values[n][who] for n in seen.parameters}
         given |= {b.name: getattr(self.fix, b.name)[who] for b in seen.fields}
+        given[TIME] = self.fix.t[who][:, None]
         repeated = {n: np.repeat(values, n_points, axis=0) for n, values in given.items()}
         return repeated | {n: getattr(self, n) for n in seen.shared}
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from terrafix.models.core.batch import over_members
 from terrafix.models.core.model import Model
 from terrafix.models.filters.error_state import ErrorState, Values
-from terrafix.models.filters.measurement import Observation
+from terrafix.models.filters.measurement import TIME, Observation
 from terrafix.models.filters.models import correct_model
 from terrafix.models.filters.updates import Measurement
 
@@ -36,8 +36,8 @@ class EnsembleObservation(Observation):
     Parameters
     ----------
     predict : callable
-        Of the values of the blocks (k, size), and of inputs, parameters and the message's fields
-        (k, ...) and shared arrays by name: what is measured, (k, m).
+        Of the values of the blocks (k, size), and of inputs, parameters, the message's fields and
+        its time ``t`` (k, ...) and shared arrays by name: what is measured, (k, m).
     derivative : callable
         Likewise the derivative by the error of all blocks, (k, m, n).
     shared : sequence of str
@@ -95,7 +95,7 @@ def ensemble_observation(
     sizes = {b.name: b.size for b in kinds.get("fields", ())}
     sizes |= {**kinds.get("inputs", {}), **kinds.get("parameters", {})}
     values = {b.name: ca.MX.sym(b.name, b.value_size) for b in state}
-    given = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+    given = {name: ca.MX.sym(name, size) for name, size in {**sizes, TIME: 1}.items()}
     common = {name: ca.MX.sym(name, *shape) for name, shape in shapes.items()}
     error = ca.MX.sym("error", state.size)
     y = predict(state.retract(values, error), {**given, **common})
@@ -115,7 +115,8 @@ def ensemble_observation(
             k = len(next(iter(estimate.values())))
             columns = [np.zeros((state.size, 1))]
             columns += [np.reshape(estimate[name], (k, -1)).T for name in values]
-            columns += [np.reshape(told[name], (k, -1)).T for name in given]
+            timed = {TIME: np.zeros(k), **told}
+            columns += [np.reshape(timed[name], (k, -1)).T for name in given]
             # one for all: as it is, and CasADi maps over the columns of the others
             found = function.call([ca.DM(c) for c in (*columns, *(told[n] for n in common))])[0]
             rows, size = function.size_out(0)

@@ -30,6 +30,9 @@ REASONS = (
 )
 """What became of a fix, indexed by ``innovation.reason``."""
 
+TIME = "t"
+"""Name by which an observation finds the time that its fix is of [s]."""
+
 SAME_INSTANT = 1e-6
 """Largest difference of time between a fix and the prior that it corrects [s]."""
 
@@ -41,8 +44,8 @@ class Observation:
     Parameters
     ----------
     predict : callable
-        Of the values of the blocks, and of inputs, parameters and the message's fields, by name:
-        what is measured, (m, 1).
+        Of the values of the blocks, and of inputs, parameters and the message's fields, by name,
+        with ``t``, the time that the fix is of [s]: what is measured, (m, 1).
     elements : mapping of str to str
         The unit of each of the m elements, by its label.
     fields : sequence of Block
@@ -59,7 +62,8 @@ class Observation:
     Raises
     ------
     ValueError
-        If a mapped field is none of the message's, or an angle no element in radians.
+        If a mapped field is none of the message's, an angle no element in radians, or something
+        is called ``t``.
     """
 
     predict: Callable[[Values, Values], Any]
@@ -74,6 +78,11 @@ class Observation:
 
     def __post_init__(self) -> None:
         names = [block.name for block in self.fields]
+        if TIME in (*names, *self.inputs, *self.parameters):
+            raise ValueError(
+                f"an observation reads '{TIME}', which is the time that a fix is of: choose "
+                "another name"
+            )
         for name in self.mapped:
             if name not in names:
                 raise ValueError(

@@ -21,7 +21,7 @@ import casadi as ca
 from terrafix.models.core.model import Model
 from terrafix.models.core.symmetric import mirrored, semidefinite_root
 from terrafix.models.filters.error_state import ErrorState
-from terrafix.models.filters.measurement import Observation, corrected
+from terrafix.models.filters.measurement import TIME, Observation, corrected
 from terrafix.models.filters.process import Process, propagate
 from terrafix.models.filters.robust import THRESHOLDS, robust_rule
 from terrafix.models.filters.updates import Measurement, update_rule
@@ -240,7 +240,7 @@ def correct_model(
         )
     arrived = fresh > 0.5
     fix["present"] = ca.if_else(arrived, fix["present"], 0.0)
-    measurement = observation.about(state, prior, fix, {**inputs, **parameters})
+    measurement = observation.about(state, prior, fix, {**inputs, **parameters, TIME: fix_t})
     outcome = corrected(
         state,
         prior,
@@ -355,7 +355,8 @@ def sensor_model(name: str, state: ErrorState, observation: Observation) -> Mode
     inputs = {key: ca.SX.sym(key, size) for key, size in sizes.items()}
     parameters = {key: ca.SX.sym(key, size) for key, size in observation.parameters.items()}
     sigma, noise = (ca.SX.sym(key, observation.size) for key in ("sigma", "noise"))
-    y = ca.SX(observation.predict(values, {**inputs, **parameters})) + sigma * noise
+    time = ca.SX.sym("time")
+    y = ca.SX(observation.predict(values, {**inputs, **parameters, TIME: time})) + sigma * noise
     for k in observation.angular:
         y[k] -= 2 * pi * ca.floor((y[k] + pi) / (2 * pi))
     free = {e.element_hash() for e in ca.symvar(y)}
@@ -376,4 +377,5 @@ def sensor_model(name: str, state: ErrorState, observation: Observation) -> Mode
             "fix.present": ca.SX.ones(observation.size),
             "fix.valid": ca.SX(1),
         },
+        time=time if time.element_hash() in free else None,
     )

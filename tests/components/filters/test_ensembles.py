@@ -25,8 +25,8 @@ ELEMENTS = {"bearing": "rad", "range": "m"}
 
 
 def bearing_and_range(x, given):
-    """Of a beacon, in axes that are turned by q, with a bias of its place."""
-    d = given["beacon"] + x["bias"] - x["r"]
+    """Of a beacon that moves, in axes that are turned by q, with a bias of its place."""
+    d = given["beacon"] + x["bias"] - x["r"] + given["t"] * ca.DM([0.2, -0.1])
     turn = 2 * ca.atan2(x["q"][2], x["q"][3])
     return ca.vertcat(ca.atan2(d[1], d[0]) - turn, ca.sqrt(ca.dot(d, d)))
 
@@ -85,17 +85,18 @@ class World(NoisyComponent):
             ca.SX.sym("b", 2),
             ca.SX.sym("k"),
         )
-        w, dt = ca.SX.sym("w", 7), ca.SX.sym("dt")
+        w, dt, t = ca.SX.sym("w", 7), ca.SX.sym("dt"), ca.SX.sym("t")
         angle = ca.norm_2(turn) + 1e-30
         q = ca.vertcat(turn / angle * ca.sin(angle / 2), ca.cos(angle / 2))
         beacon = ca.if_else(ca.fmod(k, 2) > 0.5, ca.DM(BEACONS[0]), ca.DM(BEACONS[1]))
-        h = bearing_and_range({"r": r, "q": q, "bias": bias}, {"beacon": beacon})
+        h = bearing_and_range({"r": r, "q": q, "bias": bias}, {"beacon": beacon, "t": t})
         noise = ca.vertcat(0.01 * w[5], 0.2 * w[6])
         return Model(
             "world",
             states={"r": r, "turn": turn, "bias": bias, "k": k},
             noise={"w": w},
             step=dt,
+            time=t,
             initial={"r": 3 * w[:2], "turn": 0.05 * w[2:5], "bias": 0.5 * w[5:7], "k": 0},
             next={
                 "r": r + 0.2 * ca.sqrt(dt) * w[:2],
