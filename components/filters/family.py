@@ -20,6 +20,7 @@ the last one's posterior goes to `predict`. They step at one rate, their fixes c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -60,6 +61,14 @@ def estimate_fields(state: ErrorState) -> dict[str, Field]:
     )
     times = {f"t_{i}": Field((1,), "s", doc="of its clones") for i in state.instants}
     return {block.name: value_field(block) for block in state} | times | {"P": P}
+
+
+def start_fields(state: ErrorState, told: Sequence[str]) -> dict[str, Field]:
+    """Fields of a message that tells some blocks: their values, and the covariance P."""
+    blocks = [block for block in state if block.name in told]
+    size = sum(block.size for block in blocks)
+    P = Field((size, size), "1", doc="covariance of their error")
+    return {block.name: value_field(block) for block in blocks} | {"P": P}
 
 
 def fix_fields(observation: Observation) -> dict[str, Field]:
@@ -162,12 +171,12 @@ class FilterPredict(SymbolicComponent):
                     fields={"index": Field((), "1")}, at="start", doc="makes its clones anew"
                 )
             if cls.told:
-                told = [block for block in state if block.name in cls.told]
-                size = sum(block.size for block in told)
-                start = {block.name: value_field(block) for block in told}
-                start["P"] = Field((size, size), "1", doc="covariance of their error")
+                start = start_fields(state, cls.told)
                 ports["start"] = MessageInput(
                     fields=start, needed_at_start=True, doc="last known state, at t = 0"
+                )
+                ports["restart"] = MessageInput(
+                    fields=start, at="start", optional=True, doc="state to begin anew from, later"
                 )
             declare(cls, **ports)
         super().__init_subclass__(**options)
@@ -189,6 +198,7 @@ class FilterPredict(SymbolicComponent):
             self.process,
             told=self.told,
             sigmas=self._sigmas,
+            restarts=bool(self.told),
         )
 
 

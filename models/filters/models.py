@@ -1,7 +1,7 @@
 r"""The two models that every filter is: predict, and correct, made of what it estimates.
 
 `predict_model` keeps the estimate, moves it by the process, and begins anew where a posterior
-comes; `correct_model` weighs a prior against a fix. Late in a chain of corrections a model is told
+comes, or where it is told to start again; `correct_model` weighs a prior against a fix. Late in a chain of corrections a model is told
 by `earlier` that the estimate it reads was corrected before it, so that its own is the posterior
 even where it has no fix.
 """
@@ -31,6 +31,7 @@ def predict_model(
     *,
     told: Sequence[str],
     sigmas: Mapping[str, str],
+    restarts: bool = False,
 ) -> Model:
     """The estimate between fixes, and the covariance of its error.
 
@@ -45,19 +46,26 @@ def predict_model(
     sigmas : mapping of str to str
         Of the other blocks, which start at zero (no rotation): the parameter that holds the sigma
         of each of their elements.
+    restarts : bool
+        Take ``restart.*``, a start message of a later instant. Where it is fresh, the step begins
+        as the filter does at t = 0: blocks told are those of the message, with its ``P``; the
+        others are zero (no rotation) with their sigma, and no covariance with any block remains;
+        clones are as if never made, unless their instant is this one. A posterior of the same
+        instant is not taken: it corrects what is given up.
 
     Returns
     -------
     Model
         Inputs of the process; ``posterior.*`` and the flag ``posterior.fresh``, which makes the
         step begin there; ``INSTANT.fresh``, which makes its clones anew at the start of the step;
-        for the start alone ``start.*`` of the blocks told, and ``start.P``.
-        Outputs ``prior.*``.
+        for the start alone ``start.*`` of the blocks told, and ``start.P``; where it restarts,
+        ``restart.*`` likewise, and the flag ``restart.fresh``. Outputs ``prior.*``.
 
     Raises
     ------
     ValueError
-        If a block is neither told nor has a sigma, or both, or does not exist.
+        If a block is neither told nor has a sigma, or both, or does not exist; or it restarts
+        and no block is told.
     """
     names = [block.name for block in state]
     for block in [*told, *sigmas]:
@@ -77,14 +85,25 @@ def predict_model(
     own, posterior = state.symbols("own"), state.symbols("posterior")
     fresh, step, time = (ca.SX.sym(key) for key in ("posterior_fresh", "dt", "time"))
     begin = {key: ca.if_else(fresh > 0.5, posterior[key], own[key]) for key in own}
+    # one that the process knows as well is the same: a stationary Gauss-Markov process's
+    sigma = {key: parameters.get(key, ca.SX.sym(key)) for key in sigmas.values()}
+    own_sigma = {block: sigma[key] for block, key in sigmas.items()}
+    start, initial = _start("start", state, told, own_sigma)
+    if restarts:
+        if not told:
+            raise ValueError(
+                f"filter '{name}' restarts, and no block is told: name in `told` what a start "
+                "message says"
+            )
+        again, anew = _start("restart", state, told, own_sigma)
+        afresh = start["restart.fresh"] = ca.SX.sym("restart_fresh")
+        start |= again
+        begin = {key: ca.if_else(afresh > 0.5, anew[key], begin[key]) for key in begin}
     marks = {instant: ca.SX.sym(f"{instant}_fresh") for instant in state.instants}
     for instant, mark in marks.items():
         made = state.cloned(begin, instant, time - step)
         begin = {key: ca.if_else(mark > 0.5, made[key], begin[key]) for key in begin}
     moved = propagate(state, process, begin, {**inputs, **parameters}, step, time)
-    # one that the process knows as well is the same: a stationary Gauss-Markov process's
-    sigma = {key: parameters.get(key, ca.SX.sym(key)) for key in sigmas.values()}
-    start, initial = _start(state, told, {block: sigma[key] for block, key in sigmas.items()})
     following = {**begin, **moved.values, "P": moved.covariance(begin["P"])}
     free = ca.symvar(ca.vertcat(*(ca.vec(ca.SX(value)) for value in following.values())))
     uses_time = time.element_hash() in {element.element_hash() for element in free}
@@ -108,16 +127,16 @@ def predict_model(
 
 
 def _start(
-    state: ErrorState, told: Sequence[str], sigmas: Mapping[str, Any]
+    head: str, state: ErrorState, told: Sequence[str], sigmas: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Inputs of the start message, and the estimate that they make."""
+    """Inputs of a start message, and the estimate that they make."""
     blocks = [block for block in state if block.name in told]
     size = sum(block.size for block in blocks)
-    start = {f"start.{b.name}": ca.SX.sym(f"start_{b.name}", b.value_size) for b in blocks}
+    start = {f"{head}.{b.name}": ca.SX.sym(f"{head}_{b.name}", b.value_size) for b in blocks}
     P = ca.SX(state.size, state.size)
     if blocks:
-        start["start.P"] = ca.SX.sym("start_P", size, size)
-        at, whole = 0, mirrored(start["start.P"])
+        start[f"{head}.P"] = ca.SX.sym(f"{head}_P", size, size)
+        at, whole = 0, mirrored(start[f"{head}.P"])
         rows: list[tuple[slice, slice]] = []
         for block in blocks:
             place = state.places[block.name]
@@ -129,7 +148,7 @@ def _start(
     for name, sigma in sigmas.items():
         for k in range(state.places[name].start, state.places[name].stop):
             P[k, k] = sigma**2
-    initial = {b.name: start.get(f"start.{b.name}", b.start()) for b in state}
+    initial = {b.name: start.get(f"{head}.{b.name}", b.start()) for b in state}
     for block in state:
         if block.clone_of:
             initial[block.name] = initial[block.clone_of]
