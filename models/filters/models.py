@@ -1,9 +1,9 @@
 r"""The two models that every filter is: predict, and correct, made of what it estimates.
 
 `predict_model` keeps the estimate, moves it by the process, and begins anew where a posterior
-comes, or where it is told to start again; `correct_model` weighs a prior against a fix. Late in a chain of corrections a model is told
-by `earlier` that the estimate it reads was corrected before it, so that its own is the posterior
-even where it has no fix.
+comes, or where it is told to start again; `correct_model` weighs a prior against a fix. Late in a
+chain of corrections a model is told by `earlier` that the estimate it reads was corrected before
+it, so that its own is the posterior even where it has no fix.
 """
 
 from __future__ import annotations
