@@ -182,8 +182,10 @@ class FilterAcquisition(Component):
     def _initialize_impl(self) -> None:
         self.fail(~self.start.fresh, "no 'start' was received at t = 0")
         state, n_members = self.error_state.present, self.n_members
+        self.is_acquired, self.effective = 0.0, float(self.n_particles)
         who = np.flatnonzero(self.environment.active)
-        self.is_acquired = 0.0
+        if not len(who):
+            return
         P = np.zeros((n_members, state.size, state.size))
         place = state.places
         rows: list[int] = []
@@ -203,7 +205,6 @@ class FilterAcquisition(Component):
             who,
             self._particles.drawn({n: v[who] for n, v in values.items()}, P[who], draws[who]),
         )
-        self.effective = float(self.n_particles)
         self._weigh_fix(0.0, who)
         self._tell(0.0, who)
 
