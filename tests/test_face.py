@@ -38,6 +38,18 @@ def test_the_face_is_what_it_was():
     assert dir(tf) == FACE
 
 
+FILTERS = [
+    *("Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState", "FilterAcquisition"),
+    *("FilterCorrect", "FilterEvaluation", "FilterPredict", "Observation", "Process", "clone"),
+    *("considered", "ensemble_observation", "rotation", "vector"),
+]
+
+
+def test_what_filters_are_made_of_is_what_it_was():
+    assert tf.filters.__all__ == FILTERS
+    assert all(getattr(tf.filters, name).__doc__ for name in FILTERS)
+
+
 @pytest.mark.parametrize("name", FACE)
 def test_every_name_is_there(name):
     found = getattr(tf, name)

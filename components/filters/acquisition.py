@@ -100,7 +100,9 @@ class FilterAcquisition(Component):
             cls._particles = Particles(state, cls.process, cls.observation, cls.linear)
             start = start_fields(state, cls.told)
             ports: dict[str, Any] = {
-                "start": MessageInput(fields=start, needed_at_start=True, doc="wide prior at t = 0"),
+                "start": MessageInput(
+                    fields=start, needed_at_start=True, doc="wide prior at t = 0"
+                ),
                 "fix": MessageInput(fields=fix_fields(cls.observation), doc="the fix"),
                 "acquired": MessageOutput(fields=start, doc="state to begin anew from, once"),
                 "estimate": BundleOutput(
@@ -168,7 +170,9 @@ class FilterAcquisition(Component):
         super().bind(environment)
         k, n_particles = environment.n_members, self.n_particles
         state, n = self.error_state.present, self.error_state.present.size
-        shapes = {f"particles:{b.name}": (n_particles, b.value_size) for b in state}
+        shapes: dict[str, tuple[int, ...]] = {
+            f"particles:{b.name}": (n_particles, b.value_size) for b in state
+        }
         shapes |= {"kernels": (n_particles, n, n), "weights": (n_particles,)}
         self.state_arrays |= {name: np.zeros((k, *shape)) for name, shape in shapes.items()}
 

@@ -100,8 +100,10 @@ def systematic(weights: FloatArray, u: FloatArray) -> NDArray[np.int64]:
     ends = np.cumsum(weights, axis=1)
     ends /= ends[:, -1:]
     places = (u[:, None] + np.arange(n)) / n
-    found = np.array([np.searchsorted(e, p, side="right") for e, p in zip(ends, places, strict=True)])
-    return np.minimum(found, n - 1)
+    found = np.empty(weights.shape, dtype=np.int64)
+    for row, e, p in zip(found, ends, places, strict=True):
+        row[:] = np.minimum(np.searchsorted(e, p, side="right"), n - 1)
+    return found
 
 
 def normalized_weights(logarithms: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -110,7 +112,7 @@ def normalized_weights(logarithms: FloatArray) -> tuple[FloatArray, NDArray[np.b
     What is not a number has no weight; where none has any, all are alike.
     """
     usable = np.isfinite(logarithms)
-    some = usable.any(axis=1)
+    some: NDArray[np.bool_] = usable.any(axis=1)
     clean = np.where(usable, logarithms, -np.inf)
     clean[~some] = 0.0
     weights = np.exp(clean - clean.max(axis=1, keepdims=True))
@@ -327,9 +329,7 @@ class Particles:
             part = replace(about, noise=lambda error: about.noise(error) / beta)
             kernel = ekf_update(mirrored(B), part, 0.0)
             spread = mirrored(kernel.P)
-            error = kernel.correction + ca.mtimes(
-                semidefinite_root(spread), ca.sqrt(1 - KEPT) * z
-            )
+            error = kernel.correction + ca.mtimes(semidefinite_root(spread), ca.sqrt(1 - KEPT) * z)
             zero = ca.SX.zeros(state.size)
             H = about.sensitivity(zero)
             linear, _, sound = _square(

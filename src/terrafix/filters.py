@@ -3,6 +3,7 @@
 ``docs/howto/a_filter_of_your_own.md`` is one from the first line to its verdict.
 """
 
+from terrafix.components.filters.acquisition import FilterAcquisition as FilterAcquisition
 from terrafix.components.filters.ensembles import EnsembleCorrect as EnsembleCorrect
 from terrafix.components.filters.family import FilterCorrect as FilterCorrect
 from terrafix.components.filters.family import FilterPredict as FilterPredict
@@ -19,7 +20,7 @@ from terrafix.models.filters.measurement import Observation as Observation
 from terrafix.models.filters.process import Process as Process
 
 __all__ = [
-    *("Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState", "FilterCorrect"),
-    *("FilterEvaluation", "FilterPredict", "Observation", "Process", "clone", "considered"),
-    *("ensemble_observation", "rotation", "vector"),
+    *("Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState", "FilterAcquisition"),
+    *("FilterCorrect", "FilterEvaluation", "FilterPredict", "Observation", "Process", "clone"),
+    *("considered", "ensemble_observation", "rotation", "vector"),
 ]

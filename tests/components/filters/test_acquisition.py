@@ -86,7 +86,7 @@ def test_two_peaks_are_not_acquired_and_one_is(seed):
     assert right[far].mean() >= 0.99
 
 
-# ------------------------------------------------- ranges in a plane: from lost to an ordinary filter
+# ----------------------------------------------- ranges in a plane: from lost to a usual filter
 
 STATE = ErrorState(vector("r", 2, unit="m"), vector("v", 2, unit="m/s"))
 PROCESS = Process(

@@ -153,9 +153,9 @@ def test_where_all_is_linear_particles_are_the_kalman_filter(linear):
     """Mean and covariance of 50 members after 5 fixes, by 2000 particles each.
 
     In sigmas, an error of a weighted mean has the variance 1 / N of the effective number N, at each
-    fix anew: 0.08 here. Resampling adds up to as much, and members in a tail have fewer than their
-    weights say: twice that, in the root of the mean square. Covariances likewise. What is systematic
-    is of the order 1 / N: not seen beyond four standard errors of 50 members, and 0.03.
+    fix anew: a root of 0.08 here. Resampling adds up to as much, and members in a tail have fewer
+    than their weights say: twice that, in the root of the mean square. Covariances likewise. What
+    is systematic is of the order 1 / N: not seen beyond four standard errors of 50 members or 0.03.
     """
     d, C, variance = compared(linear, 2000)
     expected = np.sqrt(variance.mean())
@@ -201,7 +201,9 @@ def test_a_step_adds_the_noise_of_the_process():
     start = {"r": np.zeros((1, 2)), "v": np.zeros((1, 2))}
     P = np.diag([1.0, 1, 0, 0])
     cloud = particles.drawn(start, P[None], rng.normal(size=(1, 4000, 4)))
-    cloud = particles.moved(cloud, {"psd": np.full((1, 1), PSD)}, dt, dt, rng.normal(size=(1, 4000, 4)))
+    cloud = particles.moved(
+        cloud, {"psd": np.full((1, 1), PSD)}, dt, dt, rng.normal(size=(1, 4000, 4))
+    )
     Q = PSD * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
     root = np.linalg.inv(np.linalg.cholesky(P + Q))
     C = particles.moments(cloud)[1][0]
