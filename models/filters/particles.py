@@ -112,7 +112,7 @@ def normalized_weights(logarithms: FloatArray) -> tuple[FloatArray, NDArray[np.b
     What is not a number has no weight; where none has any, all are alike.
     """
     usable = np.isfinite(logarithms)
-    some: NDArray[np.bool_] = usable.any(axis=1)
+    some: NDArray[np.bool_] = np.asarray(usable.any(axis=1))
     clean = np.where(usable, logarithms, -np.inf)
     clean[~some] = 0.0
     weights = np.exp(clean - clean.max(axis=1, keepdims=True))

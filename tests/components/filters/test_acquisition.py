@@ -160,7 +160,7 @@ class World(tf.Component):
         self.fix.publish(t, y=y, beacon=beacon, R=R, present=1.0)
 
 
-def plane(*, acquire=True, seed=1, duration="14", silent=0.0, **settings):
+def plane(*, acquire=True, seed=1, duration="14", silent=0.0, delay="0", **settings):
     with tf.System("plane", duration=duration, seed=seed) as system:
         world, predict = system.add(World(silent=silent), "world"), system.add(Predict(), "predict")
         correct, judge = system.add(Correct(), "correct"), system.add(Judge(), "judge")
@@ -176,7 +176,7 @@ def plane(*, acquire=True, seed=1, duration="14", silent=0.0, **settings):
             settings = {"r_acquired": "2 km", "n_particles": 1000, **settings}
             found = system.add(Acquire(**settings), "acquire")
             system.connect(world["start"], found["start"])
-            system.connect(world["fix"], found["fix"])
+            system.connect(world["fix"], found["fix"], delay=delay)
             system.connect(found["acquired"], predict["restart"])
             outputs = ("is_acquired", "effective", "r_spread", "v_spread", "estimate")
             system.record("found", [found[n] for n in outputs], rate=tf.Rate("1"))
@@ -204,6 +204,52 @@ def test_an_extended_filter_is_lost_alone_and_consistent_with_acquisition_before
     resting = acquired[:-1] > 0
     np.testing.assert_array_equal(spread[1:][resting], spread[:-1][resting])
     assert (found["acquire.effective"].values[-1] >= 100).all()
+
+
+def test_a_fix_of_another_instant_is_not_weighed():
+    """Delivered a second late: the prior of 70 km stays, within its draw of 500 particles."""
+    found = outcomes(tf.simulate(plane(n_particles=500, duration="5", delay="1"), members=3))
+    np.testing.assert_allclose(found["acquire.r_spread"][-1], PRIOR, rtol=5 / np.sqrt(500))
+    assert (found["acquire.effective"] == 500).all()
+
+
+def test_few_effective_particles_are_not_enough():
+    """Of all, which no fix leaves: it is never acquired, however small the sigma."""
+    settings = {"n_particles": 300, "effective_part": 1.0}
+    found = outcomes(tf.simulate(plane(duration="6", **settings), members=3))
+    assert (found["acquire.r_spread"][-1] < 2 * KM).all()
+    assert not found["acquire.is_acquired"].any()
+
+
+def test_acquired_is_told_once_with_what_the_particles_say():
+    with tf.System("told", duration="6", seed=1) as system:
+        world, listener = system.add(World(), "world"), system.add(Listener(), "listener")
+        acquire = system.add(Acquire(r_acquired="2 km", n_particles=300), "acquire")
+        system.connect(world["start"], acquire["start"])
+        system.connect(world["fix"], acquire["fix"])
+        system.connect(acquire["acquired"], listener["told"])
+        system.record("all", [acquire["estimate"], acquire["is_acquired"]], rate=tf.Rate("1"))
+    simulation = tf.Simulation(system, members=5)
+    simulation.run_until("6")
+    told = listener.told
+    assert told.sequence.tolist() == [1] * 5
+    found = simulation.result(wall_s=0.0).dataset
+    first = np.argmax(found["acquire.is_acquired"].values > 0, axis=0)
+    np.testing.assert_array_equal(told.t, first)
+    for m, k in enumerate(first):
+        for name in ("r", "v", "P"):
+            expected = found[f"acquire.estimate.{name}"].values[k, m]
+            np.testing.assert_array_equal(getattr(told, name)[m], expected)
+
+
+class Listener(tf.Component):
+    """Keeps what it is told."""
+
+    default_rate = tf.Rate("1")
+    told = tf.MessageInput(fields=Acquire.declarations["acquired"].fields)
+
+    def _step_impl(self, t, dt):
+        pass
 
 
 def outcomes(result):
