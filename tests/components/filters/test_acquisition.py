@@ -213,6 +213,13 @@ def test_a_fix_of_another_instant_is_not_weighed():
     assert (found["acquire.effective"] == 500).all()
 
 
+def test_a_prior_alone_is_not_acquired():
+    """A sigma of 700 km is asked for: reached at t = 0, told just after the first fix, at 1 s."""
+    settings = {"n_particles": 100, "r_acquired": "700 km"}
+    found = outcomes(tf.simulate(plane(duration="2", **settings), members=3))
+    assert found["acquire.is_acquired"].tolist() == [[0.0] * 3, [1.0] * 3, [1.0] * 3]
+
+
 def test_few_effective_particles_are_not_enough():
     """Of all, which no fix leaves: it is never acquired, however small the sigma."""
     settings = {"n_particles": 300, "effective_part": 1.0}

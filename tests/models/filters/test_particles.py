@@ -102,6 +102,38 @@ def test_without_kernels_weights_are_those_of_the_likelihood(taken, monkeypatch)
         np.testing.assert_array_equal(cloud.values[name], array)
 
 
+def test_with_kernels_weights_of_a_linear_measurement_are_exact(monkeypatch):
+    """N(y; H x, H B H' + R), of kernels that differ, whatever was drawn; the kernels' part is kept.
+
+    What was drawn has the covariance (1 - c) (I - K H) B about x + K r: of 400 particles alike, its
+    variances are within 4 sqrt(2 / 400) = 0.28.
+    """
+    monkeypatch.setattr(module, "TAKEN", 0.0)
+    monkeypatch.setattr(module, "RESAMPLED", 0.0)
+    rng, k, n = np.random.default_rng(8), 2, 400
+    B = rng.normal(size=(k, n, 4, 4)) * np.exp(rng.normal(size=(k, n, 1, 1)))
+    B = B @ B.transpose(0, 1, 3, 2)
+    r, v = rng.normal(size=(2, k, n, 2))
+    r[1], v[1], B[1] = r[1, 0], v[1, 0], B[1, 0]  # all alike
+    x = np.concatenate([r, v], axis=-1)
+    cloud = Cloud({"r": r.copy(), "v": v.copy()}, B.copy(), np.full((k, n), 1 / n))
+    R, y = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([0.7, -0.4])
+    message = {"y": y, "R": R, "present": np.ones(2)}
+    message = {name: np.tile(a, (k, *[1] * np.ndim(a))) for name, a in message.items()}
+    Particles(STATE, PROCESS, LINEAR).weighed(cloud, message, {}, *draws(rng, k, n, 4))
+    S, off = H @ B @ H.T + R, y - x @ H.T
+    square = np.einsum("kni,knij,knj->kn", off, np.linalg.inv(S), off)
+    expected, _ = normalized_weights(-(square + np.log(np.linalg.det(S))) / 2)
+    np.testing.assert_allclose(cloud.weights, expected, rtol=1e-9)
+    K = B @ H.T @ np.linalg.inv(S)
+    after = (np.eye(4) - K @ H) @ B
+    np.testing.assert_allclose(cloud.kernels, module.KEPT * after, rtol=1e-6, atol=1e-9)
+    drawn = np.concatenate([cloud.values["r"], cloud.values["v"]], axis=-1)[1]
+    drawn -= x[1] + (K[1] @ off[1, ..., None])[..., 0]
+    root = np.linalg.inv(np.linalg.cholesky((1 - module.KEPT) * after[1, 0]))
+    np.testing.assert_allclose(np.cov(root @ drawn.T), np.eye(4), atol=0.28)
+
+
 def test_a_fix_whose_noise_is_not_positive_definite_explains_nothing():
     particles = Particles(STATE, PROCESS, Observation(lambda x, _: x["r"], ELEMENTS))
     rng = np.random.default_rng(3)
@@ -176,7 +208,7 @@ def test_errors_fall_as_the_root_of_the_number_of_particles():
 def test_a_prior_is_what_its_particles_and_kernels_say():
     """To the error of 4000: 4 / sqrt(4000) = 0.06 sigma, and 0.09 of a variance; as correlated."""
     state = ErrorState(vector("b", 1), rotation("q", side="right"), vector("v", 2))
-    particles = Particles(state, Process(), Observation(lambda x, _: x["b"], {"b": "1"}), ("v",))
+    particles = Particles(state, Process(), Observation(lambda x, _: x["b"], {"b": "1"}), ("b",))
     rng = np.random.default_rng(5)
     root = np.tril(rng.normal(size=(6, 6))) + 3 * np.eye(6)
     root[1:4] *= 0.02  # of a rotation, small
