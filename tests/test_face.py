@@ -19,6 +19,7 @@ FACE = [
     *(
         "SharedOutput",
         "Simulation",
+        "SmoothedRun",
         "State",
         "Statistic",
         "StepError",
@@ -28,7 +29,7 @@ FACE = [
     ),
     *("Table", "TerrafixError", "Text", "WindowInput", "WiringError", "__version__"),
     *("check_fmu", "components", "export_fmu", "filters", "linear_covariance", "read_result"),
-    *("read_system", "run_campaign", "simulate", "testing", "write_system"),
+    *("read_system", "run_campaign", "simulate", "smooth_run", "testing", "write_system"),
 ]
 
 
@@ -36,6 +37,19 @@ def test_the_face_is_what_it_was():
     """A name that goes, or comes, is a decision: users build on these."""
     assert tf.__all__ == FACE
     assert dir(tf) == FACE
+
+
+FILTERS = [
+    *("ALARMS", "Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState"),
+    *("FilterAcquisition", "FilterCorrect", "FilterEvaluation", "FilterMonitor", "FilterPredict"),
+    *("FilterSensor", "FilterTruth", "Observation", "Process", "clone", "considered"),
+    *("ensemble_observation", "rotation", "vector"),
+]
+
+
+def test_what_filters_are_made_of_is_what_it_was():
+    assert tf.filters.__all__ == FILTERS
+    assert all(getattr(tf.filters, name).__doc__ for name in FILTERS)
 
 
 @pytest.mark.parametrize("name", FACE)

@@ -71,7 +71,7 @@ def estimate_fields(state: ErrorState) -> dict[str, Field]:
 
 
 def start_fields(state: ErrorState, told: Collection[str]) -> dict[str, Field]:
-    """Fields of a message that tells where blocks start."""
+    """Fields of a message that tells some blocks: their values, and the covariance P."""
     blocks = [block for block in state if block.name in told]
     size = sum(block.size for block in blocks)
     P = Field((size, size), "1", doc="covariance of their error")
@@ -255,10 +255,14 @@ class FilterPredict(SymbolicComponent):
                     fields={"index": Field((), "1")}, at="start", doc="makes its clones anew"
                 )
             if cls.told:
+                start = start_fields(state, cls.told)
                 ports["start"] = MessageInput(
                     fields=start_fields(state, cls.told),
                     needed_at_start=True,
                     doc="last known state, at t = 0",
+                )
+                ports["restart"] = MessageInput(
+                    fields=start, at="start", optional=True, doc="state to begin anew from, later"
                 )
             declare(cls, **ports)
         super().__init_subclass__(**options)
@@ -277,6 +281,7 @@ class FilterPredict(SymbolicComponent):
             told=self.told,
             sigmas=starting_sigmas(self.error_state, self.told, self.sigmas),
             smoothed=self.smoothed,
+            restarts=bool(self.told),
         )
 
 

@@ -99,6 +99,15 @@ class SymbolicComponent(Component):
 
     capabilities: ClassVar[Capabilities] = Capabilities(symbolic=True)
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "time" in cls.declarations:
+            raise TypeError(
+                f"{cls.__name__} declares reserved names ['time']: a kernel gets the clock's time "
+                "under that name\n  call it otherwise; a model that needs the clock's says "
+                "Model(..., time=symbol)"
+            )
+
     def build_model(self) -> SymbolicModel:
         """Build the model for the present structural settings."""
         raise NotImplementedError(f"{type(self).__name__} must provide build_model()")

@@ -1,9 +1,9 @@
 r"""The two models that every filter is: predict, and correct, made of what it estimates; its twins.
 
 `predict_model` keeps the estimate, moves it by the process, and begins anew where a posterior
-comes; `correct_model` weighs a prior against a fix. Late in a chain of corrections a model is told
-by `earlier` that the estimate it reads was corrected before it, so that its own is the posterior
-even where it has no fix.
+comes, or where it is told to start again; `correct_model` weighs a prior against a fix. Late in a
+chain of corrections a model is told by `earlier` that the estimate it reads was corrected before
+it, so that its own is the posterior even where it has no fix.
 
 The twins are what a filter believes, made true: `truth_model` draws a start and the noise of the
 process, `sensor_model` measures as an observation says. Against them a filter is consistent, or not
@@ -38,6 +38,7 @@ def predict_model(
     told: Sequence[str],
     sigmas: Mapping[str, str],
     smoothed: bool = False,
+    restarts: bool = False,
 ) -> Model:
     """The estimate between fixes, and the covariance of its error.
 
@@ -55,20 +56,27 @@ def predict_model(
     smoothed : bool
         Put out besides what a smoother needs: the transition of the error since the posterior that
         the estimate began with, or the start.
+    restarts : bool
+        Take ``restart.*``, a start message of a later instant. Where it is fresh, the step begins
+        as the filter does at t = 0: blocks told are those of the message, with its ``P``; the
+        others are zero (no rotation) with their sigma, and no covariance with any block remains;
+        clones are as if never made, unless their instant is this one. A posterior of the same
+        instant is not taken: it corrects what is given up.
 
     Returns
     -------
     Model
         Inputs of the process; ``posterior.*`` and the flag ``posterior.fresh``, which makes the
         step begin there; ``INSTANT.fresh``, which makes its clones anew at the start of the step;
-        for the start alone ``start.*`` of the blocks told, and ``start.P``.
-        Outputs ``prior.*``; ``error_transition`` (n, n) and the time
-        ``transition_since`` [s], if `smoothed`.
+        for the start alone ``start.*`` of the blocks told, and ``start.P``; where it restarts,
+        ``restart.*`` likewise, and the flag ``restart.fresh``. Outputs ``prior.*``;
+        ``error_transition`` (n, n) and the time ``transition_since`` [s], if `smoothed`.
 
     Raises
     ------
     ValueError
-        If a block is neither told nor has a sigma, or both, or does not exist.
+        If a block is neither told nor has a sigma, or both, or does not exist; or it restarts
+        and no block is told.
     """
     names = [block.name for block in state]
     for block in [*told, *sigmas]:
@@ -88,24 +96,39 @@ def predict_model(
     own, posterior = state.symbols("own"), state.symbols("posterior")
     fresh, step, time = (ca.SX.sym(key) for key in ("posterior_fresh", "dt", "time"))
     begin = {key: ca.if_else(fresh > 0.5, posterior[key], own[key]) for key in own}
+    # one that the process knows as well is the same: a stationary Gauss-Markov process's
+    sigma = {key: parameters.get(key, ca.SX.sym(key)) for key in sigmas.values()}
+    own_sigma = {block: sigma[key] for block, key in sigmas.items()}
+    start, initial = _start("start", state, told, own_sigma)
+    given_up = ca.SX(0)
+    if restarts:
+        if not told:
+            raise ValueError(
+                f"filter '{name}' restarts, and no block is told: name in `told` what a start "
+                "message says"
+            )
+        again, anew = _start("restart", state, told, own_sigma)
+        afresh = start["restart.fresh"] = ca.SX.sym("restart_fresh")
+        start |= again
+        begin = {key: ca.if_else(afresh > 0.5, anew[key], begin[key]) for key in begin}
+        given_up = afresh
     marks = {instant: ca.SX.sym(f"{instant}_fresh") for instant in state.instants}
     gone = ca.SX.sym("transition", state.size, state.size)
-    phi = ca.if_else(fresh > 0.5, ca.SX.eye(state.size), gone)
+    phi = ca.if_else(ca.fmax(fresh, given_up) > 0.5, ca.SX.eye(state.size), gone)
     for instant, mark in marks.items():
         made = state.cloned(begin, instant, time - step)
         begin = {key: ca.if_else(mark > 0.5, made[key], begin[key]) for key in begin}
         phi = ca.if_else(mark > 0.5, ca.mtimes(state.cloning(instant), phi), phi)
     moved = propagate(state, process, begin, {**inputs, **parameters}, step, time)
-    # one that the process knows as well is the same: a stationary Gauss-Markov process's
-    sigma = {key: parameters.get(key, ca.SX.sym(key)) for key in sigmas.values()}
-    start, initial = _start(state, told, {block: sigma[key] for block, key in sigmas.items()})
     following = {**begin, **moved.values, "P": moved.covariance(begin["P"])}
     states = dict(own)
     outputs = {f"prior.{key}": symbol for key, symbol in own.items()}
     if smoothed:
         since = ca.SX.sym("since")
         following["error_transition"] = ca.mtimes(moved.transition, phi)
-        following["transition_since"] = ca.if_else(fresh > 0.5, time - step, since)
+        # nothing before a start anew is smoothed: what was estimated then was given up
+        begun = ca.if_else(fresh > 0.5, time - step, since)
+        following["transition_since"] = ca.if_else(given_up > 0.5, NEVER, begun)
         initial["error_transition"] = ca.densify(ca.SX.eye(state.size))
         carried = {"error_transition": gone, "transition_since": since}
         states |= carried
@@ -132,16 +155,16 @@ def predict_model(
 
 
 def _start(
-    state: ErrorState, told: Sequence[str], sigmas: Mapping[str, Any]
+    head: str, state: ErrorState, told: Sequence[str], sigmas: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Inputs of the start message, and the estimate that they make."""
+    """Inputs of a start message, and the estimate that they make."""
     blocks = [block for block in state if block.name in told]
     size = sum(block.size for block in blocks)
-    start = {f"start.{b.name}": ca.SX.sym(f"start_{b.name}", b.value_size) for b in blocks}
+    start = {f"{head}.{b.name}": ca.SX.sym(f"{head}_{b.name}", b.value_size) for b in blocks}
     P = ca.SX(state.size, state.size)
     if blocks:
-        start["start.P"] = ca.SX.sym("start_P", size, size)
-        at, whole = 0, mirrored(start["start.P"])
+        start[f"{head}.P"] = ca.SX.sym(f"{head}_P", size, size)
+        at, whole = 0, mirrored(start[f"{head}.P"])
         rows: list[tuple[slice, slice]] = []
         for block in blocks:
             place = state.places[block.name]
@@ -153,7 +176,7 @@ def _start(
     for name, sigma in sigmas.items():
         for k in range(state.places[name].start, state.places[name].stop):
             P[k, k] = sigma**2
-    initial = {b.name: start.get(f"start.{b.name}", b.start()) for b in state}
+    initial = {b.name: start.get(f"{head}.{b.name}", b.start()) for b in state}
     for block in state:
         if block.clone_of:
             initial[block.name] = initial[block.clone_of]
@@ -306,7 +329,9 @@ def truth_model(
     moved = propagate(present, process, values, {**inputs, **parameters}, step, time)
     end = present.retract(moved.values, ca.mtimes(semidefinite_root(moved.spread), noise))
     sigma = {key: parameters.get(key, ca.SX.sym(key)) for key in sigmas.values()}
-    start, initial = _start(present, told, {block: sigma[key] for block, key in sigmas.items()})
+    start, initial = _start(
+        "start", present, told, {block: sigma[key] for block, key in sigmas.items()}
+    )
     begin = present.retract(initial, ca.mtimes(semidefinite_root(initial["P"]), first))
     following = present.normalized(end)
     free = ca.symvar(ca.vertcat(*following.values()))

@@ -3,6 +3,7 @@
 ``docs/howto/a_filter_of_your_own.md`` is one from the first line to its verdict.
 """
 
+from terrafix.components.filters.acquisition import FilterAcquisition as FilterAcquisition
 from terrafix.components.filters.ensembles import EnsembleCorrect as EnsembleCorrect
 from terrafix.components.filters.family import FilterCorrect as FilterCorrect
 from terrafix.components.filters.family import FilterPredict as FilterPredict
@@ -23,8 +24,8 @@ from terrafix.models.filters.monitor import ALARMS as ALARMS
 from terrafix.models.filters.process import Process as Process
 
 __all__ = [
-    *("ALARMS", "Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState", "FilterCorrect"),
-    *("FilterEvaluation", "FilterMonitor", "FilterPredict", "FilterSensor", "FilterTruth"),
-    *("Observation", "Process", "clone", "considered", "ensemble_observation", "rotation"),
-    "vector",
+    *("ALARMS", "Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState"),
+    *("FilterAcquisition", "FilterCorrect", "FilterEvaluation", "FilterMonitor", "FilterPredict"),
+    *("FilterSensor", "FilterTruth", "Observation", "Process", "clone", "considered"),
+    *("ensemble_observation", "rotation", "vector"),
 ]

@@ -6,6 +6,7 @@ import pytest
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.noise import NormalStream
+from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import Input, MessageInput, MessageOutput, Output
 from terrafix.cosim.engine.simulation import Simulation
@@ -260,3 +261,13 @@ def test_a_message_is_sent_when_the_model_says_so_and_at_zero_if_that_is_a_step(
     toys.fly(toys.wire({"c": toys.Clock(), "t": kind(rate=rate), "r": reader}, links), 3)
     assert [validity for _, _, validity, _ in reader.found] == expected
     assert [value for *_, value in reader.found] == expected
+
+
+@pytest.mark.parametrize("declared", [Parameter(0.0, unit="s"), Input(unit="s"), Output(unit="s")])
+def test_the_name_of_the_clock_cannot_be_declared(declared):
+    """It would be overwritten by the clock without a word; a component of one's own may have it."""
+    with pytest.raises(
+        TypeError, match=r"reserved names \['time'\]: a kernel .*\n  call it otherwise"
+    ):
+        type("Late", (Drift,), {"time": declared})
+    type("Free", (Component,), {"time": Output(unit="s")})
