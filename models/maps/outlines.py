@@ -258,9 +258,9 @@ def _check_degrees(ring: FloatArray, what: str) -> None:
         raise ValueError(f"{what}: the longitude of point {k + 1} is {ring[k, 0]:.10g} deg")
 
 
-def _cleaned(ring: ArrayLike, what: str, *, outer: bool) -> FloatArray:
+def _cleaned(given: ArrayLike, what: str, *, outer: bool) -> FloatArray:
     """Ring without closing, repeated and out-and-back vertices, turned as `Outline` says."""
-    ring = np.array(ring, np.float64)
+    ring = np.array(given, np.float64)
     if ring.ndim != 2 or ring.shape[1] != 2:
         raise ValueError(f"{what} needs longitude and latitude of each point")
     _check_degrees(np.degrees(ring), what)
