@@ -107,3 +107,25 @@ TIES: dict[str, Any] = {"shape": (None,)}
 
 PLACES: dict[str, Any] = {"shape": (None, None, 3), "unit": ("rad", "rad", "m")}
 """Latitude, longitude and height of a reference's tie points: their rows, their columns."""
+
+CORNERS: dict[str, Any] = {"shape": (None, 3), "unit": "m", "frame": "e"}
+"""Vertices of the rings of all lakes, one ring after the other, not closed."""
+
+STARTS: dict[str, Any] = {"shape": (None,), "dtype": np.int64}
+"""Where rings start in their vertices, and where the last one ends: rings + 1 numbers.
+
+The first rings are the shores of the lakes, in their order and counterclockwise seen from above;
+those after them are islands, clockwise.
+"""
+
+OWNER: dict[str, Any] = {"shape": (None,), "dtype": np.int64}
+"""Which lake each ring belongs to: k of the shore of lake k."""
+
+CENTERS: dict[str, Any] = {"shape": (None, 3), "unit": "m", "frame": "e"}
+"""Center of each lake, at its surface."""
+
+RADII: dict[str, Any] = {"shape": (None,), "unit": "m"}
+"""From the center of each lake to its farthest vertex."""
+
+AREAS: dict[str, Any] = {"shape": (None,), "unit": "m^2"}
+"""Area of each lake on the ellipsoid, of the rings that are there: its islands less."""

@@ -28,6 +28,7 @@ TYPES = sorted(n for n, e in component_entries().items() if e.value.startswith("
 IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("earlier_pass", "image_album", "image_former", "image_matcher"),
     *("recorded_echo", "recorded_reference", "reference_file", "scene_echo", "terrain"),
+    "lake_catalog",  # and of maps of lakes: in truth/test_lakes
 }
 FOREIGN = {"fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
 SIZES = (1, 7, 100)

@@ -77,7 +77,7 @@ SYSTEM_MISTAKES = {
         "type = 3",
         "ConfigurationError: 'imu' has the type 3, which is no name\n"
         "  component types: antenna_mount, attitude_sensor, earlier_pass, fmu, fmu_loop, "
-        "image_album, image_former, image_matcher, imu, last_known_state, linear, "
+        "image_album, image_former, image_matcher, imu, lake_catalog, last_known_state, linear, "
         "lvlh_attitude, mekf_correct, mekf_predict, mekf_predict_smoothed, "
         "navigation_evaluation, orbit, "
         "recorded_attitude, recorded_echo, recorded_imu, recorded_orbit, recorded_reference, "
