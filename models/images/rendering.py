@@ -105,25 +105,50 @@ def render_polygon(
     ValueError
         As `outline`; if the image has no pixels.
     """
-    if min(width, height) < 1:
-        raise ValueError(f"an image has one pixel or more along each side, got {width} x {height}")
-    starts, ends = [], []
+    rings = []
     for ring, turn in ((vertices, 1), *((hole, -1) for hole in holes)):
-        p = outline(ring) + 0.5
+        p = outline(ring)
         local, after = p - p[0], np.roll(p - p[0], -1, axis=0)
         area = (local[:, 0] * after[:, 1] - after[:, 0] * local[:, 1]).sum()
-        p = p if area * turn < 0 else p[::-1]  # coverage lies to the right of edges that go down
-        starts.append(p)
-        ends.append(np.roll(p, -1, axis=0))
-    p0, p1 = _cut(np.concatenate(starts), np.concatenate(ends), (width, height))
+        rings.append(p if area * turn > 0 else p[::-1])
+    return ring_coverage(rings, width, height)
+
+
+def ring_coverage(rings: Sequence[FloatArray], width: int, height: int) -> FloatArray:
+    """Sum of the coverage by rings, without a check: those that turn from y to x count negative.
+
+    Parameters
+    ----------
+    rings : sequence of ndarray, shape (K, 2) [px]
+        Where one crosses itself, what it winds around twice counts twice.
+    width, height : int
+        Of the image [px].
+
+    Returns
+    -------
+    ndarray, shape (height, width)
+
+    Raises
+    ------
+    ValueError
+        If the image has no pixels.
+    """
+    if min(width, height) < 1:
+        raise ValueError(f"an image has one pixel or more along each side, got {width} x {height}")
+    if not rings:
+        return np.zeros((height, width))
+    # coverage lies to the right of edges that go up, y down
+    ends = np.concatenate(rings) + 0.5
+    starts = np.concatenate([np.roll(ring, -1, axis=0) for ring in rings]) + 0.5
+    p0, p1 = _cut(starts, ends, (width, height))
     middle, rise = (p0 + p1) / 2, p1[:, 1] - p0[:, 1]
     row = np.floor(middle[:, 1]).astype(np.intp)
     seen = (row >= 0) & (row < height) & (middle[:, 0] < width)
     x, rise, row = np.maximum(middle[seen, 0], 0.0), rise[seen], row[seen]
     column = x.astype(np.intp)
-    index = row * (width + 1) + column
-    cells = np.bincount(index, rise * (column + 1 - x), height * (width + 1))
-    cells += np.bincount(index + 1, rise * (x - column), height * (width + 1) + 1)[:-1]
+    index, n = row * (width + 1) + column, height * (width + 1)
+    cells = np.bincount(index, rise * (column + 1 - x), n)
+    cells += np.bincount(index + 1, rise * (x - column), n)
     covered = np.cumsum(cells.reshape(height, width + 1), axis=1)[:, :width]
     return np.ascontiguousarray(covered)
 
