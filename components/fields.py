@@ -108,6 +108,19 @@ TIES: dict[str, Any] = {"shape": (None,)}
 PLACES: dict[str, Any] = {"shape": (None, None, 3), "unit": ("rad", "rad", "m")}
 """Latitude, longitude and height of a reference's tie points: their rows, their columns."""
 
+MOST_VERTICES = 1024
+"""Of an outline in an image."""
+
+CONTOUR: dict[str, Any] = {"shape": (MOST_VERTICES, 2), "unit": "px", "ragged": True}
+"""Vertices of the outline of a lake in an image, not closed."""
+
+LOOK = {
+    "lake": Field((), "1", doc="number of the lake in its catalog"),
+    "sigma": Field((), "px", doc="of the noise of each coordinate of each vertex"),
+    "whole": Field((), "1", doc="1 where all of the outline is in the frame, else 0"),
+}
+"""What lake an outline is of, and how well it is known."""
+
 CORNERS: dict[str, Any] = {"shape": (None, 3), "unit": "m", "frame": "e"}
 """Vertices of the rings of all lakes, one ring after the other, not closed."""
 

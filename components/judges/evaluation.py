@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from terrafix.components.judges.filter_evaluation import FilterEvaluation
 from terrafix.cosim.basics.clock import Rate
+from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
 from terrafix.models.filters.spacecraft import STATE, sar_observation
 
 
@@ -13,3 +14,17 @@ class NavigationEvaluation(FilterEvaluation):
     default_rate = Rate("8.2")
     error_state, observation = STATE, sar_observation()
     called = {"r_e": "position", "v_e": "velocity", "q_mu": "misalignment"}  # noqa: RUF012
+
+
+class OrbitEvaluation(FilterEvaluation):
+    """Errors of an inertial orbit, NEES of the position, and what became of each look at a lake."""
+
+    default_rate = Rate("1/30")
+    error_state, observation, judged = ORBIT, lake_observation(ORBIT), ("r",)
+    called = {"r": "position", "v": "velocity"}  # noqa: RUF012
+
+
+class ConsideredOrbitEvaluation(OrbitEvaluation):
+    """The same of a filter that considers the camera's misalignment and the catalog's scale."""
+
+    error_state, observation = CONSIDERED, lake_observation(CONSIDERED)

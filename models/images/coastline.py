@@ -315,9 +315,7 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
 def _land(image: FloatArray) -> FloatArray:
     """Brightness of land: a plane through what is neither darker nor brighter than most."""
     y, x = (np.linspace(-1, 1, n) for n in image.shape)
-    planes = np.stack(
-        [np.ones(image.size), np.tile(x, len(y)), np.repeat(y, len(x))], axis=1
-    )
+    planes = np.stack([np.ones(image.size), np.tile(x, len(y)), np.repeat(y, len(x))], axis=1)
     values = image.ravel()
     fit = np.full(values.shape, np.median(values))
     for _ in range(_ROUNDS):

@@ -1,0 +1,58 @@
+"""The filter of a satellite that knows lakes, in two sizes: with what it considers, or without."""
+
+from __future__ import annotations
+
+from terrafix.components.fields import CENTERS, CORNERS, STARTS
+from terrafix.components.filters.ensembles import EnsembleCorrect
+from terrafix.components.filters.family import FilterPredict
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import SharedInput
+from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation, orbit_process
+from terrafix.models.geometry.earth import EARTH
+
+
+class OrbitPredict(FilterPredict):
+    """An orbit between two looks at a lake: position and velocity, inertial."""
+
+    default_rate = Rate("1/30")
+    error_state, process, told = ORBIT, orbit_process(), ("r", "v")
+
+    mu = Parameter(EARTH.mu, unit="m^3/s^2", positive=True, doc="gravitational parameter")
+    radius = Parameter(EARTH.radius, unit="m", positive=True, doc="equatorial radius")
+    j2 = Parameter(EARTH.j2, doc="second zonal coefficient; 0: two bodies")
+    accel_psd = Parameter(0.0, unit="m^2/s^3", minimum=0.0, doc="process noise of velocity")
+
+
+class ConsideredOrbitPredict(OrbitPredict):
+    """The same beside a misalignment and a scale that count, and are not estimated."""
+
+    error_state = CONSIDERED
+
+    attitude_sigma0 = Parameter(
+        0.0, unit="rad", minimum=0.0, doc="of the camera's misalignment, per axis"
+    )
+    scale_sigma0 = Parameter(0.0, minimum=0.0, doc="of the scale of outlines in the catalog")
+
+
+class LakeCorrect(EnsembleCorrect):
+    """Correction of an orbit by the moments of a lake's outline in the frame of a camera."""
+
+    default_rate = Rate("1/30")
+    error_state, observation = ORBIT, lake_observation(ORBIT)
+
+    focal = Parameter(unit="px", positive=True, doc="focal length of the camera")
+    principal = Parameter([160.0, 128.0], shape=(2,), unit="px", doc="its principal point")
+    earth_angle0 = Parameter(0.0, unit="rad", doc="inertial to Earth-fixed x axis at t = 0")
+    rotation_rate = Parameter(
+        EARTH.rotation_rate, unit="rad/s", doc="Earth rotation, as the filter knows it"
+    )
+    vertices = SharedInput(**CORNERS)
+    starts = SharedInput(**STARTS)
+    center = SharedInput(**CENTERS)
+
+
+class ConsideredLakeCorrect(LakeCorrect):
+    """The same with a misalignment and a scale that count, and are not estimated."""
+
+    error_state, observation = CONSIDERED, lake_observation(CONSIDERED)

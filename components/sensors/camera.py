@@ -1,0 +1,146 @@
+"""A camera that looks down, and the outlines of lakes that it sees."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.components.fields import (
+    CENTERS,
+    CONTOUR,
+    CORNERS,
+    LOOK,
+    MOST_VERTICES,
+    RADII,
+    STARTS,
+    XYZ,
+)
+from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Choice, Parameter
+from terrafix.cosim.declare.ports import Input, MessageOutput, Output, SharedInput
+from terrafix.models.core.batch import over_members
+from terrafix.models.filters.lake import CAMERA, Seen
+from terrafix.models.filters.measurement import TIME
+from terrafix.models.geometry.earth import EARTH
+from terrafix.models.geometry.frames import rotate_about_pole
+
+rotate_about_pole_array = over_members(rotate_about_pole, (), (3,))
+
+CLIPPING = ("frame", "none")
+"""What becomes of an outline that is not wholly in the frame."""
+
+
+class LakeCamera(Component):
+    """Outlines of lakes in the frame of a camera that looks to the center of the Earth.
+
+    Its attitude is that of the flight: the optical axis to the center of the Earth, the velocity
+    upward in the frame, but for a misalignment that every member draws once. Each frame shows one
+    lake, the nearest to its center of those that are wholly in it, or in it at all.
+    """
+
+    default_rate = Rate("1/30")
+
+    focal = Parameter(unit="px", positive=True, doc="focal length: width / (2 tan(angle / 2))")
+    size = Parameter([320.0, 256.0], shape=(2,), unit="px", positive=True, doc="of the frame")
+    principal = Parameter([160.0, 128.0], shape=(2,), unit="px", doc="principal point")
+    earth_angle0 = Parameter(0.0, unit="rad", doc="inertial to Earth-fixed x axis at t = 0")
+    rotation_rate = Parameter(EARTH.rotation_rate, unit="rad/s", doc="Earth rotation")
+    vertex_sigma = Parameter(0.25, unit="px", minimum=0.0, doc="noise of every vertex")
+    attitude_sigma = Parameter(
+        0.0, unit="rad", minimum=0.0, doc="of the misalignment about each axis, drawn once"
+    )
+    catalog_sigma = Parameter(
+        0.0, unit="m", minimum=0.0, doc="of the true vertices about the catalog's, drawn once"
+    )
+    clipping = Choice(
+        CLIPPING,
+        "frame",
+        doc="frame: an outline that is not wholly in it is told as such; none: a frame without end",
+    )
+
+    r_i = Input((3,), unit="m", frame="i", doc="true position")
+    v_i = Input((3,), unit="m/s", frame="i", doc="true velocity")
+    vertices = SharedInput(**CORNERS)
+    starts = SharedInput(**STARTS)
+    center = SharedInput(**CENTERS)
+    radius = SharedInput(**RADII)
+
+    contour = MessageOutput(**CONTOUR, doc="vertices of the lake's outline in the frame")
+    look = MessageOutput(fields=LOOK, doc="which lake it is, and how well it is seen")
+    attitude = Output((3,), unit="rad", frame="c", labels=XYZ, doc="misalignment of the camera")
+
+    def _initialize_impl(self) -> None:
+        n = self.n_members
+        self.attitude = self.attitude_sigma[:, None] * self.normals("attitude", 3)
+        self._longest = longest = int(np.diff(self.starts[: len(self.center) + 1]).max())
+        if longest > MOST_VERTICES:
+            raise ConfigurationError(
+                f"'{self.name}' sees outlines of {MOST_VERTICES} vertices at most; its catalog has "
+                f"one of {longest}\n  select smaller lakes, or a coarser source"
+            )
+        self._moved = None
+        if self.catalog_sigma.any():
+            draw = self.normals("catalog", self.vertices.size).reshape(n, -1, 3)
+            self._moved = self.catalog_sigma[:, None, None] * draw
+        self._look(0.0)
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        self._look(t)
+
+    def _look(self, t: float) -> None:
+        n, longest = self.n_members, self._longest
+        vertices = np.full((n, MOST_VERTICES, 2), np.nan)
+        count, lake, whole = np.zeros(n, dtype=np.int64), np.zeros(n), np.zeros(n)
+        noise = self.normals("vertices", 2 * longest).reshape(n, longest, 2)
+        for lakes in self._candidates(t).T:  # nearest first; a whole outline before any other
+            for number in np.unique(lakes[lakes >= 0]):
+                rows = np.flatnonzero((lakes == number) & (whole < 0.5))
+                pixels, inside = self._outline(number, rows, t)
+                complete = inside.all(axis=1)
+                taken = complete | ((count[rows] == 0) & inside.any(axis=1))
+                own, size = rows[taken], pixels.shape[1]
+                sigma = self.vertex_sigma[own, None, None]
+                vertices[own, :size] = pixels[taken] + sigma * noise[own, :size]
+                count[own], lake[own], whole[own] = size, number, complete[taken]
+        self.contour.publish(t, vertices, count=count, valid=count > 0)
+        self.look.publish(t, valid=count > 0, lake=lake, sigma=self.vertex_sigma, whole=whole)
+
+    def _outline(
+        self, lake: int, rows: NDArray[np.int64], t: float
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Pixels (k, K, 2) of a lake's vertices, and which of them are in the frame."""
+        begin, end = self.starts[lake : lake + 2]
+        points = self.vertices[begin:end]
+        if self._moved is not None:
+            points = points + self._moved[rows, begin:end]
+        values = {"r": self.r_i[rows], "v": self.v_i[rows], "attitude": self.attitude[rows]}
+        given = {name: getattr(self, name)[rows] for name in CAMERA} | {TIME: np.full(len(rows), t)}
+        seen = Seen(values, given, points, self.center[lake])
+        inside = seen.depth > 0.0
+        if self.clipping == "frame":
+            size = self.size[rows, None]
+            inside &= ((seen.pixels > -0.5) & (seen.pixels < size - 0.5)).all(axis=2)
+        return seen.pixels, inside
+
+    def _candidates(self, t: float) -> NDArray[np.int64]:
+        """Lakes that may be in each member's frame, nearest to the axis first; -1 for none."""
+        angle = self.earth_angle0 + self.rotation_rate * t
+        r_e = rotate_about_pole_array(angle, self.r_i)
+        down = -r_e / np.linalg.norm(r_e, axis=1, keepdims=True)
+        off = self.center - r_e[:, None]
+        depth = np.einsum("mld,md->ml", off, down)
+        across = np.linalg.norm(off - depth[..., None] * down[:, None], axis=2)
+        seen = np.einsum("ld,mld->ml", self.center, off) < 0.0  # above the horizon
+        if self.clipping == "frame":
+            reach = np.linalg.norm(self.size, axis=1) / self.focal
+            seen &= across - self.radius < reach[:, None] * depth
+        seen &= self.environment.active[:, None]
+        order = np.argsort(np.where(seen, across, np.inf), axis=1)[:, :_NEAREST]
+        return np.where(np.take_along_axis(seen, order, axis=1), order, -1)
+
+
+_NEAREST = 4
+"""Lakes that are looked at in one frame."""
