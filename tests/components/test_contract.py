@@ -252,7 +252,8 @@ def _components(file: Path) -> list[str]:
     bases += ("_Echo", "_Reference")
     # of a filter's own classes
     bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation", "FilterMonitor")
-    abstract = (*bases, "EnsembleCorrect")
-    bases += ("MekfPredict",)
+    bases += ("EnsembleCorrect",)
+    abstract = (*bases, "FilterAcquisition", "FilterSensor", "FilterTruth")
+    bases += ("LakeCorrect", "MekfPredict", "OrbitEvaluation", "OrbitPredict")
     derived = [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
     return [name for name in derived if name not in abstract]
