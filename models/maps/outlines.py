@@ -266,15 +266,16 @@ def _cleaned(given: ArrayLike, what: str, *, outer: bool) -> FloatArray:
     _check_degrees(np.degrees(ring), what)
     ring[:, 0] = wrapped(ring[:, 0])
     p = authalic_vectors(ring[:, 0], ring[:, 1])
-    while len(ring):
+    while len(ring) > 1:
         behind, ahead = np.roll(p, 1, axis=0), np.roll(p, -1, axis=0)
         drop = (p == behind).all(axis=1)
-        if drop.all():
-            drop[0] = False
-        if not drop.any():
+        if drop[0]:  # closed: the first vertex stays the first
+            drop[:] = False
+            drop[-1] = True
+        elif not drop.any():
             back = (behind == ahead).all(axis=1)
             drop[np.argmax(back)] = back.any()
-        if len(ring) < 3 or not drop.any():
+        if not drop.any():
             break
         ring, p = ring[~drop], p[~drop]
     n = len(np.unique(p, axis=0))
