@@ -407,7 +407,11 @@ def _ring(points: object, where: str) -> FloatArray:
                 f"{where}: point {k} of a ring is {json.dumps(point)[:40]}; it takes "
                 "[longitude, latitude] in degrees"
             )
-    return ring_from_degrees([point[:2] for point in points], where)
+    try:
+        degrees = np.array([point[:2] for point in points], np.float64)
+    except OverflowError:
+        raise ValueError(f"{where} has coordinates that no number can hold") from None
+    return ring_from_degrees(degrees, where)
 
 
 # ------------------------------------------------------------------------- shapefiles
@@ -450,7 +454,11 @@ def _read_shapefile(
                     continue
                 for polygon in _parts(item.shape, f"'{name}', shape {k} of '{path}'"):
                     yield name, polygon
-    except (shapefile.ShapefileException, struct.error, EOFError, IndexError) as error:
+    except (shapefile.ShapefileException, struct.error, EOFError, LookupError) as error:
+        raise ValueError(f"'{path}' is not {what}: it is damaged ({error})") from error
+    except ValueError as error:
+        if str(path) in str(error):
+            raise
         raise ValueError(f"'{path}' is not {what}: it is damaged ({error})") from error
 
 

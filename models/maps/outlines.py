@@ -220,9 +220,11 @@ def ring_from_degrees(degrees: ArrayLike, what: str, *, closed: bool = True) -> 
     ring = np.asarray(degrees, np.float64)
     if ring.ndim != 2 or ring.shape[1] != 2:
         raise ValueError(f"{what} needs longitude and latitude of each point")
+    if not len(ring):
+        raise ValueError(f"{what} has a ring without points")
     _check_degrees(ring, what)
     if closed:
-        if len(ring) and (ring[0] != ring[-1]).any():
+        if (ring[0] != ring[-1]).any():
             raise ValueError(
                 f"{what} is open: it starts at {_place(np.radians(ring), 0)}, and ends at "
                 f"{_place(np.radians(ring), -1)}\n  repeat the first point at the end; "
