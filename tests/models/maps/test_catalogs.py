@@ -205,6 +205,8 @@ CHOSEN = {
     "by name": ({"names": ("small", "BIG")}, ["Big", "Small"]),
     "by box": ({"box": deg(-80, 40, -70, 45)}, ["Small"]),
     "by a box beyond a turn": ({"box": deg(280, 40, 290, 45)}, ["Small"]),
+    "its western shore beyond the box": ({"box": deg(283.02, 40, 290, 45)}, ["Small"]),
+    "its eastern shore beyond the box": ({"box": deg(270, 40, 283.08, 45)}, ["Small"]),
     "across 180 degrees": ({"box": deg(170, -90, -170, 90)}, ["Middle"]),
     "all around": ({"box": deg(-180, -40, 180, 45)}, ["Small", "Middle"]),
     "centroid not in the box": ({"box": deg(9, 49, 10.3, 51)}, ["Big"]),
@@ -220,6 +222,19 @@ CHOSEN = {
 def test_lakes_are_selected(write, how):
     options, names = CHOSEN[how]
     assert [lake.name for lake in read_lakes(write(THREE), Selection(**options))] == names
+
+
+def test_the_largest_stand_in_the_order_of_the_file(write):
+    lakes = read_lakes(write(collection(*THREE["features"][::-1])), Selection(most=2))
+    assert [lake.name for lake in lakes] == ["Middle", "Big"]
+
+
+def test_a_box_between_the_shores_of_a_lake_at_180_degrees(write):
+    """Whose ring spans 359.8 deg of longitude, as it is written."""
+    ring = [[179.9, 1], [-179.9, 1], [-179.9, 1.2], [179.9, 1.2], [179.9, 1]]
+    path = write(polygon(ring))
+    assert len(read_lakes(path, Selection(box=deg(179.95, 0, -179.95, 2)))) == 1
+    assert "none of them" in refusal(path, Selection(box=deg(0, 0, 10, 2)))
 
 
 def test_a_lake_that_is_not_selected_is_not_complained_of(write):
@@ -333,6 +348,15 @@ def test_parts_and_their_islands_are_told_apart_by_direction(shapes):
     cut = [square(179.9, -30), square(-180, -30)]
     assert len(read_lakes(shapes([("Cut", cut)]))) == 1
     assert len(read_lakes(shapes([("Turned", [square(1, 2)[::-1]])]))) == 1
+
+
+def test_an_island_in_a_lake_on_an_island_in_a_lake(shapes):
+    """Each island belongs to the smallest lake around it: Taal, and Vulcan Point in it."""
+    rings = [square(0, 0, 1.0), square(0.2, 0.2, 0.6)[::-1]]
+    rings += [square(0.3, 0.3, 0.4), square(0.4, 0.4, 0.1)[::-1]]
+    lakes = read_lakes(shapes([("Taal", rings)]))
+    assert [len(lake.islands) for lake in lakes] == [1, 1]
+    assert lakes[1].area / lakes[1].outer_area == pytest.approx(15 / 16, rel=1e-3)
 
 
 PROJECTIONS = {

@@ -247,6 +247,18 @@ def any_pair(xy):
     )
 
 
+@pytest.mark.parametrize("first", [0, 1, 2, 31, 32, 33, 63, 64, 68, 69])
+def test_one_crossing_is_found_wherever_the_ring_starts(first):
+    """Of two of 70 edges of a circle, in the closing edge too."""
+    angle = 2 * np.pi * np.arange(70) / 70
+    xy = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    assert crossing(np.roll(xy, first, axis=0)) is None
+    xy[[0, 1]] = xy[[1, 0]]
+    found = crossing(np.roll(xy, first, axis=0))
+    assert found is not None
+    assert {(k - first) % 70 for k in found} == {69, 1}
+
+
 def test_passing_through_itself_in_a_vertex_is_a_crossing_and_touching_is_none():
     through = np.array([[0, 0], [1, 1], [2, 2], [2, 0], [1, 1], [0, 2]], float)
     touch = np.array([[0, 0], [1, 1], [2, 0], [2, 2], [1, 1], [0, 2]], float)
