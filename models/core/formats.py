@@ -29,6 +29,7 @@ _KINDS = (
     (b"\xff\xd8\xff", "a picture (JPEG)", f"read it with an imaging library, and {_NUMPY}"),
     (b"\0\0\0\x0cjP", "JPEG 2000", f"read it with GDAL or rasterio, and {_NUMPY}"),
     (b"%PDF", "a PDF", "name the file that is meant"),
+    (b"SQLite format 3\0", "SQLite (a GeoPackage)", f"read it with GDAL, and {_NUMPY}"),
     (b"<?xml", "XML", "name the file with the data, which it may only describe"),
 )
 """First bytes, what begins with them, and what to do with it."""

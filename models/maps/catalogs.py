@@ -30,6 +30,7 @@ import difflib
 import importlib.util
 import json
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -406,7 +407,11 @@ def _ring(points: object, where: str) -> FloatArray:
                 f"{where}: point {k} of a ring is {json.dumps(point)[:40]}; it takes "
                 "[longitude, latitude] in degrees"
             )
-    return ring_from_degrees([point[:2] for point in points], where)
+    try:
+        degrees = np.array([point[:2] for point in points], np.float64)
+    except OverflowError:
+        raise ValueError(f"{where} has coordinates that no number can hold") from None
+    return ring_from_degrees(degrees, where)
 
 
 # ------------------------------------------------------------------------- shapefiles
@@ -426,6 +431,7 @@ def _read_shapefile(
     found, cure = kind_of(path)
     if found:
         raise ValueError(f"'{path}' is not {what}: it is {found}\n  {_cure(cure)}")
+    _check_header_of_shapes(path, what)
     for suffix in (".dbf", ".prj"):
         _beside(path, suffix)
     _check_prj(path)
@@ -448,12 +454,26 @@ def _read_shapefile(
                     continue
                 for polygon in _parts(item.shape, f"'{name}', shape {k} of '{path}'"):
                     yield name, polygon
-    except (shapefile.ShapefileException, EOFError, IndexError, UnicodeError) as error:
+    except (shapefile.ShapefileException, struct.error, EOFError, LookupError) as error:
         raise ValueError(f"'{path}' is not {what}: it is damaged ({error})") from error
-    except Exception as error:
-        if type(error).__module__ not in ("struct", "_struct", "array"):
+    except ValueError as error:
+        if str(path) in str(error):
             raise
         raise ValueError(f"'{path}' is not {what}: it is damaged ({error})") from error
+
+
+def _check_header_of_shapes(path: Path, what: str) -> None:
+    """Refuse a file (.shp) whose first 100 bytes are not those of the format, or that is cut."""
+    with path.open("rb") as file:
+        head = file.read(100)
+    if len(head) < 100 or head[:4] != struct.pack(">i", 9994):
+        raise ValueError(f"'{path}' is not {what}: it is none, or damaged\n  {_CURE}")
+    told, size = 2 * struct.unpack(">i", head[24:28])[0], path.stat().st_size
+    if told != size:
+        raise ValueError(
+            f"'{path}' is not {what}: it is damaged: it has {size} bytes, and by its header "
+            f"{told}\n  fetch it again"
+        )
 
 
 def _beside(path: Path, suffix: str) -> Path:

@@ -220,9 +220,11 @@ def ring_from_degrees(degrees: ArrayLike, what: str, *, closed: bool = True) -> 
     ring = np.asarray(degrees, np.float64)
     if ring.ndim != 2 or ring.shape[1] != 2:
         raise ValueError(f"{what} needs longitude and latitude of each point")
+    if not len(ring):
+        raise ValueError(f"{what} has a ring without points")
     _check_degrees(ring, what)
     if closed:
-        if len(ring) and (ring[0] != ring[-1]).any():
+        if (ring[0] != ring[-1]).any():
             raise ValueError(
                 f"{what} is open: it starts at {_place(np.radians(ring), 0)}, and ends at "
                 f"{_place(np.radians(ring), -1)}\n  repeat the first point at the end; "
@@ -266,15 +268,16 @@ def _cleaned(given: ArrayLike, what: str, *, outer: bool) -> FloatArray:
     _check_degrees(np.degrees(ring), what)
     ring[:, 0] = wrapped(ring[:, 0])
     p = authalic_vectors(ring[:, 0], ring[:, 1])
-    while len(ring):
+    while len(ring) > 1:
         behind, ahead = np.roll(p, 1, axis=0), np.roll(p, -1, axis=0)
         drop = (p == behind).all(axis=1)
-        if drop.all():
-            drop[0] = False
-        if not drop.any():
+        if drop[0]:  # closed: the first vertex stays the first
+            drop[:] = False
+            drop[-1] = True
+        elif not drop.any():
             back = (behind == ahead).all(axis=1)
             drop[np.argmax(back)] = back.any()
-        if len(ring) < 3 or not drop.any():
+        if not drop.any():
             break
         ring, p = ring[~drop], p[~drop]
     n = len(np.unique(p, axis=0))
