@@ -45,6 +45,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -71,6 +72,10 @@ _BRIGHT, _BRIGHTER = 5.0, 0.15
 _SPECK = 3
 """Pixels that a cloud must have."""
 _STEPS = 4
+_STRIDE = 0.5
+"""Largest move of a vertex in one step [px]."""
+_TAILS = 6.0
+"""Where the Gaussian point spread is cut, in its standard deviations."""
 _KERNEL = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
 """Smoothing of vertices' moves along the contour."""
 _SIDES = 1e-9
@@ -134,6 +139,17 @@ class Coastline:
     noise: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Nearby:
+    """Pixels near rings, and which ring, segment and place on it is nearest; each (n,)."""
+
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+    ring: NDArray[np.intp]
+    segment: NDArray[np.intp]
+    parameter: FloatArray
+
+
 def coastline(
     image: ArrayLike, *, blur: float = 0.0, margin: float = 4.0, smallest: float = 20.0
 ) -> Coastline:
@@ -170,10 +186,12 @@ def coastline(
             "large\n  lower smallest, or take an image with the whole lake in it"
         )
     height, width = f.shape
-    reach = 1.5 + 2.5 * blur
-    band = _dilated(_border(f), reach) & ~hidden
+    reach = 1.5 + 2 * blur
+    near = _nearby(found, f, hidden, reach)
     coasts = [_coast(ring, hidden) for ring in found]
-    rings = _fitted(found, coasts, f, band, blur, reach)
+    rings = _fitted(found, coasts, f, near, blur)
+    band = np.zeros(f.shape, np.bool_)
+    band[near.row, near.column] = True
     covered = ring_coverage(rings, width, height)
     f = np.where(band, f, np.where(covered > 0.5, 1.0, 0.0))
     made = [
@@ -315,9 +333,7 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
 def _land(image: FloatArray) -> FloatArray:
     """Brightness of land: a plane through what is neither darker nor brighter than most."""
     y, x = (np.linspace(-1, 1, n) for n in image.shape)
-    planes = np.stack(
-        [np.ones(image.size), np.tile(x, len(y)), np.repeat(y, len(x))], axis=1
-    )
+    planes = np.stack([np.ones(image.size), np.tile(x, len(y)), np.repeat(y, len(x))], axis=1)
     values = image.ravel()
     fit = np.full(values.shape, np.median(values))
     for _ in range(_ROUNDS):
@@ -338,7 +354,7 @@ def _contours(f: FloatArray) -> list[FloatArray]:
     generator = contour_generator(x, y, np.pad(f, 1, mode="edge"), fill_type=FillType.OuterOffset)
     rings = []
     for points, offsets in zip(*generator.filled(0.5, np.inf), strict=True):
-        for k, (first, last) in enumerate(zip(offsets[:-1], offsets[1:], strict=True)):
+        for k, (first, last) in enumerate(pairwise(offsets)):
             ring = np.asarray(points[first : last - 1], np.float64)
             ring = ring[np.abs(ring - np.roll(ring, 1, axis=0)).max(axis=1) > 0]
             if len(ring) >= 3:
@@ -346,31 +362,36 @@ def _contours(f: FloatArray) -> list[FloatArray]:
     return rings
 
 
+def _nearby(rings: list[FloatArray], f: FloatArray, hidden: Mask, reach: float) -> _Nearby:
+    """Pixels within reach of a ring that are not hidden."""
+    rows, columns = np.nonzero(_dilated(_border(f), reach) & ~hidden)
+    pixels = np.stack([columns, rows], axis=1).astype(np.float64)
+    found = [distances(pixels, ring) for ring in rings]
+    apart = np.stack([n.distance for n in found])
+    ring = apart.argmin(axis=0)
+    k = np.arange(len(ring))
+    segment = np.stack([n.segment for n in found])[ring, k]
+    parameter = np.stack([n.parameter for n in found])[ring, k]
+    seen = apart[ring, k] < reach
+    return _Nearby(rows[seen], columns[seen], ring[seen], segment[seen], parameter[seen])
+
+
 def _fitted(
-    rings: list[FloatArray],
-    coasts: list[Mask],
-    f: FloatArray,
-    band: Mask,
-    blur: float,
-    reach: float,
+    rings: list[FloatArray], coasts: list[Mask], f: FloatArray, near: _Nearby, blur: float
 ) -> list[FloatArray]:
     """Move rings until their coverage is f; one that would cross itself stays as it was."""
-    rows, columns = np.nonzero(band)
-    pixels = np.stack([columns, rows], axis=1).astype(np.float64)
     height, width = f.shape
     moved = rings
     for _ in range(_STEPS):
         covered = ring_coverage(moved, width, height)
         if blur > 0:
-            covered = gaussian_filter(covered, blur, mode="nearest")
-        excess = (f - covered)[rows, columns]
-        near = [distances(pixels, ring) for ring in moved]
-        owner = np.argmin([n.distance for n in near], axis=0)
+            covered = gaussian_filter(covered, blur, mode="nearest", truncate=_TAILS)
+        excess = (f - covered)[near.row, near.column]
         after = []
-        for k, (ring, coast, n) in enumerate(zip(moved, coasts, near, strict=True)):
-            own = (owner == k) & (n.distance < reach)
-            i, t, count = n.segment[own], n.parameter[own], len(ring)
-            share = np.bincount(i, excess[own] * (1 - t), count)
+        for k, (ring, coast) in enumerate(zip(moved, coasts, strict=True)):
+            own, count = near.ring == k, len(ring)
+            i, t = near.segment[own], near.parameter[own]
+            share = np.bincount(i, excess[own] * (1 - t), count).astype(np.float64)
             share += np.roll(np.bincount(i, excess[own] * t, count), 1)
             length = np.hypot(*(np.roll(ring, -1, axis=0) - ring).T)
             length = (length + np.roll(length, 1)) / 2
@@ -378,7 +399,7 @@ def _fitted(
             along = np.roll(ring, -1, axis=0) - np.roll(ring, 1, axis=0)
             long = np.maximum(np.hypot(*along.T), 1e-9)
             outward = np.stack([along[:, 1], -along[:, 0]], axis=1) / long[:, None]
-            after.append(ring + outward * np.clip(step, -0.5, 0.5)[:, None])
+            after.append(ring + outward * np.clip(step, -_STRIDE, _STRIDE)[:, None])
         moved = after
     return [
         new if shapely.is_valid(shapely.Polygon(new)) else old
