@@ -51,11 +51,11 @@ import numpy as np
 import shapely
 from contourpy import FillType, contour_generator
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label
+from scipy.ndimage import binary_dilation, binary_erosion, label
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.images.polygons import distances
-from terrafix.models.images.rendering import ring_coverage
+from terrafix.models.images.rendering import blurred, ring_coverage
 
 Mask = NDArray[np.bool_]
 """Which pixels, or vertices."""
@@ -74,8 +74,6 @@ _SPECK = 3
 _STEPS = 4
 _STRIDE = 0.5
 """Largest move of a vertex in one step [px]."""
-_TAILS = 6.0
-"""Where the Gaussian point spread is cut, in its standard deviations."""
 _KERNEL = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
 """Smoothing of vertices' moves along the contour."""
 _SIDES = 1e-9
@@ -383,9 +381,7 @@ def _fitted(
     height, width = f.shape
     moved = rings
     for _ in range(_STEPS):
-        covered = ring_coverage(moved, width, height)
-        if blur > 0:
-            covered = gaussian_filter(covered, blur, mode="nearest", truncate=_TAILS)
+        covered = blurred(ring_coverage(moved, width, height), blur)
         excess = (f - covered)[near.row, near.column]
         after = []
         for k, (ring, coast) in enumerate(zip(moved, coasts, strict=True)):

@@ -198,7 +198,8 @@ def clip_to_frame(vertices: ArrayLike, width: int, height: int) -> Clipped:
     frame = shapely.box(-0.5, -0.5, size[0] - 0.5, size[1] - 0.5)
     parts = shapely.get_parts(shapely.intersection(polygon, frame))
     rings, edges = [], []
-    for part in parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]:
+    areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & ~shapely.is_empty(parts)
+    for part in parts[areal]:
         ring = shapely.get_coordinates(part)[:-1]
         sides = np.concatenate([ring + 0.5, ring + 0.5 - np.array(size)], axis=1)
         on = np.abs(sides) < _ON_FRAME

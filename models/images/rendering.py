@@ -12,6 +12,8 @@ and the signed sum over all pieces is the coverage [1]_. Coordinates are those o
 References
 ----------
 .. [1] D. Turner, "The FreeType smooth rasterizer": cells of area and cover, there in fixed point.
+.. [2] T. Lindeberg, "Scale-Space for Discrete Signals", IEEE Trans. Pattern Analysis and Machine
+       Intelligence 12(3), 1990.
 """
 
 from __future__ import annotations
@@ -21,13 +23,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import correlate1d, gaussian_filter
+from scipy.special import ive
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.images.polygons import outline
-
-_TAILS = 6.0
-"""Where the Gaussian point spread is cut, in its standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,7 @@ class Appearance:
         Relative growth of light from the left to the right border, and from the top to the bottom
         [-]; 1 in the frame's middle.
     blur : float
-        Standard deviation of the Gaussian point spread [px]; 0 for none. Convolved at whole pixels:
-        it keeps sums, and adds blur^2 to second moments for blur of 0.5 px and more (within
-        1 percent; more at less).
+        Standard deviation of the Gaussian point spread [px] (`blurred`); 0 for none.
     noise : float
         Standard deviation of the additive white noise [reflectance].
     bits : int
@@ -153,6 +151,29 @@ def ring_coverage(rings: Sequence[FloatArray], width: int, height: int) -> Float
     return np.ascontiguousarray(covered)
 
 
+def blurred(image: FloatArray, sigma: float) -> FloatArray:
+    r"""Convolve with the discrete Gaussian [2]_; beyond its border an image goes on as it ends.
+
+    .. math:: G_n = e^{-\sigma^2} I_n(\sigma^2)
+
+    Its sum is 1 and its variance :math:`\sigma^2` for every :math:`\sigma`, what a Gaussian sampled
+    at whole pixels has not (14 % less at 0.5 px).
+
+    Parameters
+    ----------
+    image : ndarray, shape (height, width)
+    sigma : float
+        Standard deviation [px], 0 or more.
+    """
+    if sigma == 0:
+        return image
+    reach = int(np.ceil(8 * sigma)) + 8
+    kernel = ive(np.abs(np.arange(-reach, reach + 1)), sigma**2)
+    for axis in (0, 1):
+        image = correlate1d(image, kernel, axis=axis, mode="nearest")
+    return image
+
+
 def render_scene(
     coverage: ArrayLike,
     appearance: Appearance,
@@ -201,7 +222,7 @@ def render_scene(
     y, x = (np.arange(n) / max(n - 1, 1) - 0.5 for n in f.shape)
     image = image * (1 + look.gradient[0] * x + look.gradient[1] * y[:, None])
     if look.blur > 0:
-        image = gaussian_filter(image, look.blur, mode="nearest", truncate=_TAILS)
+        image = blurred(image, look.blur)
     if look.noise > 0:
         image = image + look.noise * rng.standard_normal(f.shape)
     if look.bits > 0:
