@@ -65,6 +65,8 @@ _SMALLEST_IMAGE = 8
 _ROUNDS = 30
 _TRIM = 2.5
 """Residuals of land, in its standard deviations, beyond which something is not land."""
+_TRIM_WATER = 4.0
+"""The same of water."""
 _DARK = 6.0
 """How far water must be below land, in its standard deviations."""
 _BRIGHT, _BRIGHTER = 5.0, 0.15
@@ -91,16 +93,16 @@ class Ring:
         y to x around an island.
     coast : ndarray of bool, shape (K,)
         Which vertices are seen to lie on a coast: not on the frame, nor near a cloud.
-    sigma : ndarray, shape (K,)
-        Standard deviation of each across the coast, by the noise of pixels [px]. It is shared
-        by neighbors within some 3 px: moments of the ring have more noise than `moment_noise` says
-        for independent ones; see `gray_moments`.
+    sigma : float
+        Standard deviation of a vertex across the coast, by the noise of pixels [px]. Neighbors
+        within some 3 px share it: moments of the ring have more noise than `moment_noise` says for
+        independent vertices (see `gray_moments`). Capes and bays of a pixel are rounded besides.
     island : bool
     """
 
     vertices: FloatArray
     coast: Mask
-    sigma: FloatArray
+    sigma: float
     island: bool
 
     @property
@@ -126,7 +128,9 @@ class Coastline:
     hidden : ndarray of bool, shape (height, width)
         Clouds, and what is near them.
     noise : float
-        Standard deviation of `coverage` within the band [-].
+        Standard deviation of `coverage` of each pixel of the band, independent [-].
+    gain : float
+        That of a factor that all of the band shares, by the brightness of water [-].
     """
 
     rings: tuple[Ring, ...]
@@ -135,6 +139,7 @@ class Coastline:
     band: Mask
     hidden: Mask
     noise: float
+    gain: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +179,7 @@ def coastline(
     for name, value in (("blur", blur), ("margin", margin), ("smallest", smallest)):
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{name} is finite and 0 or more, got {value}")
-    f, noise, cloud = _coverage(_image(image), blur)
+    f, noise, gain, cloud = _coverage(_image(image), blur)
     hidden = _dilated(cloud, margin)
     found = [ring for ring in _contours(f) if abs(_area(ring)) >= max(smallest, 1e-9)]
     water = [ring for ring in found if _area(ring) > 0]
@@ -184,8 +189,7 @@ def coastline(
             "large\n  lower smallest, or take an image with the whole lake in it"
         )
     height, width = f.shape
-    reach = 1.5 + 2 * blur
-    near = _nearby(found, f, hidden, reach)
+    near = _nearby(found, f, hidden, _reach(blur))
     coasts = [_coast(ring, hidden) for ring in found]
     rings = _fitted(found, coasts, f, near, blur)
     band = np.zeros(f.shape, np.bool_)
@@ -193,11 +197,11 @@ def coastline(
     covered = ring_coverage(rings, width, height)
     f = np.where(band, f, np.where(covered > 0.5, 1.0, 0.0))
     made = [
-        Ring(ring, coast, np.full(len(ring), _vertex_noise(ring, noise, reach)), _area(ring) < 0)
+        Ring(ring, coast, _vertex_noise(ring, noise, blur), _area(ring) < 0)
         for ring, coast in zip(rings, coasts, strict=True)
     ]
     made.sort(key=lambda ring: -abs(_area(ring.vertices)))
-    return Coastline(tuple(made), (f >= 0.5) & ~hidden, f, band, hidden, noise)
+    return Coastline(tuple(made), (f >= 0.5) & ~hidden, f, band, hidden, noise, gain)
 
 
 def gray_moments(
@@ -205,6 +209,7 @@ def gray_moments(
     sigma: float = 0.0,
     band: ArrayLike | None = None,
     *,
+    gain: float = 0.0,
     blur: float = 0.0,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     r"""Moments straight from the coverage of pixels, without a contour.
@@ -229,6 +234,8 @@ def gray_moments(
         Standard deviation of the coverage of each pixel of `band` [-].
     band : array_like of bool, shape (height, width)
         Pixels that hold noise; all, if it is left out.
+    gain : float
+        Standard deviation of a factor that the coverage of all of `band` shares [-].
     blur : float
         Standard deviation of the Gaussian point spread [px].
 
@@ -245,11 +252,11 @@ def gray_moments(
     ------
     ValueError
         If `coverage` is not a plane of finite numbers, its sum is not positive, `band` has another
-        shape, or `sigma` or `blur` is negative.
+        shape, or `sigma`, `gain` or `blur` is negative.
     """
     f = _image(coverage, 1)
-    if not (sigma >= 0 and blur >= 0):
-        raise ValueError(f"sigma and blur are 0 or more, got {sigma} and {blur} px")
+    if not (sigma >= 0 and gain >= 0 and blur >= 0):
+        raise ValueError(f"sigma, gain and blur are 0 or more, got {sigma}, {gain} and {blur} px")
     noisy = np.ones(f.shape, np.bool_) if band is None else np.asarray(band, np.bool_)
     if noisy.shape != f.shape:
         raise ValueError(f"a band has the shape of the coverage, {f.shape}, got {noisy.shape}")
@@ -270,7 +277,8 @@ def gray_moments(
     trace = np.zeros(6)
     trace[1:] = -2 / area * J[1:].sum(axis=1)
     trace[3:] -= 2 * np.array([products[0, 0], products[1, 1], products[0, 1]])
-    return m, sigma**2 * J @ J.T, sigma**2 / 2 * trace
+    shared = gain * J @ f[rows, columns][n]
+    return m, sigma**2 * J @ J.T + np.outer(shared, shared), sigma**2 / 2 * trace
 
 
 def _image(image: ArrayLike, least: int = _SMALLEST_IMAGE) -> FloatArray:
@@ -291,8 +299,8 @@ def _image(image: ArrayLike, least: int = _SMALLEST_IMAGE) -> FloatArray:
     return a
 
 
-def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
-    """Coverage by water, its standard deviation, and where clouds are."""
+def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, float, Mask]:
+    """Coverage by water, standard deviations of it and of its factor, and where clouds are."""
     land = _land(image)
     if not land.min() > 0:
         raise ValueError(
@@ -316,16 +324,20 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
         before, q = q, float(np.median(ratio[inner]))
         if before == q:
             break
+    dark_pixels = ratio[inner]
+    near = np.abs(dark_pixels - q) <= max(_TRIM_WATER * spread, 0.01 * (1 - q))
+    q, n_water = float(dark_pixels[near].mean()), int(near.sum())
     if 1 - q < floor:
         raise ValueError(
             f"an image shows water, {_DARK:g} standard deviations or more darker than land; what "
             f"is dark in this one is {(1 - q) / max(spread, 1e-9):.1f} darker"
         )
+    noise = spread / (1 - q)
     cloud = ratio > 1 + max(_BRIGHT * spread, _BRIGHTER * (1 - q))
     marks, n = label(cloud, np.ones((3, 3)))
     large = np.bincount(marks.ravel(), minlength=n + 1) >= _SPECK
     large[0] = False
-    return (1 - ratio) / (1 - q), spread / (1 - q), large[marks]
+    return (1 - ratio) / (1 - q), noise, noise / n_water**0.5, large[marks]
 
 
 def _land(image: FloatArray) -> FloatArray:
@@ -409,11 +421,18 @@ def _smooth(values: FloatArray) -> FloatArray:
     return np.asarray(np.sum(parts, axis=0))
 
 
-def _vertex_noise(ring: FloatArray, noise: float, reach: float) -> float:
-    """Of a vertex across the coast [px]: of the pixels that share in its move, per length."""
+def _vertex_noise(ring: FloatArray, noise: float, blur: float) -> float:
+    """Of a vertex across the coast [px]: of the contour's two pixels, and of those that move it."""
+    slope = 1 / np.sqrt(2 * np.pi * (blur**2 + 1 / 12))  # of a straight coast's coverage
+    contour = np.sqrt(2 / 3) / slope
     length = float(np.hypot(*(np.roll(ring, -1, axis=0) - ring).T).mean())
     shared = length * _KERNEL.sum() ** 2 / (_KERNEL**2).sum()
-    return noise * float(np.sqrt(2 * reach / shared))
+    return noise * float(np.sqrt(contour**2 + 2 * _reach(blur) / shared))
+
+
+def _reach(blur: float) -> float:
+    """How far from a coast pixels are fitted [px]."""
+    return 1.5 + 2 * blur
 
 
 def _coast(ring: FloatArray, hidden: Mask) -> Mask:

@@ -119,8 +119,7 @@ def test_the_point_spread_keeps_the_sum_and_adds_its_variance():
     for blur in (0.2, 0.7, 1.5):
         g = render_scene(f, Appearance(water=1.0, land=0.0, blur=blur, bits=0), RNG(0))
         assert g.sum() == pytest.approx(f.sum(), rel=1e-9)
-        # a Gaussian at whole pixels: its variance is off by 1 percent at 0.5 px
-        np.testing.assert_allclose(np.subtract(spread(g), spread(f)), blur**2, rtol=1.2e-2)
+        np.testing.assert_allclose(np.subtract(spread(g), spread(f)), blur**2, rtol=1e-9)
 
 
 def test_noise_and_codes():
