@@ -12,28 +12,10 @@ and the ends of a long lake count most in second moments. So it is moved along i
 own coverage, exact (`rendering`) and blurred by the point spread, is the image's: in each of some
 steps a vertex moves by what the image has more than the contour near it, per length.
 
-Biases, noise-free, for the outline of Lake Seneca at 176 x 33 px (1691 px^2), over 30 places and
-angles; the largest for area, else the mean:
-
-============================  ==========  ==========  ==========  ==========
-estimator                     A [%]       A, blur     mxx [px^2]  mxx, blur
-                              sharp       0.7 px      sharp       0.7 px
-============================  ==========  ==========  ==========  ==========
-fillPoly, findContours        -10.1       .           .           .
-findContours, 8 x enlarged    -1.3        .           .           .
-contourpy, scikit-image       0.17        0.21        -2.1        -5.7
-here: contour, fitted         0.0007      0.0010      0.01        0.004
-gray moments                  < 1e-4      < 1e-4      0.0004      -0.001
-============================  ==========  ==========  ==========  ==========
-
-contourpy (which matplotlib brings) and scikit-image's ``find_contours`` give the same contours to
-rounding. With noise of 1 % (of the contrast between water and land) in every pixel, standard
-deviations of (A, x, y, mxx, myy, mxy) are (0.30, 0.013, 0.002, 0.46, 0.018, 0.07) by the fitted
-contour and (0.30, 0.013, 0.002, 0.46, 0.020, 0.07) by gray moments in a band of the same width; at
-5 % five times that. Both are as good: gray moments come with a covariance, the contour with a shape.
-
+TABLE
 Excluded as no coast: what lies near clouds, that is near pixels brighter than land, and the frame.
-A thin cloud over water that is nowhere brighter than land is not told from land.
+A thin cloud over water that is nowhere brighter than land is not told from land. Arms of water that
+are narrower than a pixel, which nowhere cover half of one, are lost, to gray moments too.
 
 Coordinates are those of `polygons`: (x, y), whole at the centers of pixels.
 
@@ -65,8 +47,12 @@ _SMALLEST_IMAGE = 8
 _ROUNDS = 30
 _TRIM = 2.5
 """Residuals of land, in its standard deviations, beyond which something is not land."""
-_TRIM_WATER = 4.0
-"""The same of water."""
+_DEEP = 25
+"""Pixels away from the coast that water's brightness is taken from; else of those nearer to it."""
+_INNER = 0.99
+"""Coverage by the contour's own, of pixels that it is taken from when there is a contour."""
+_TRIMMED = 0.9546
+"""Standard deviation of a standard normal variable within `_TRIM`."""
 _DARK = 6.0
 """How far water must be below land, in its standard deviations."""
 _BRIGHT, _BRIGHTER = 5.0, 0.15
@@ -74,6 +60,8 @@ _BRIGHT, _BRIGHTER = 5.0, 0.15
 _SPECK = 3
 """Pixels that a cloud must have."""
 _STEPS = 4
+_ROUNDED = 0.03
+"""What rounding off capes and bays of a pixel adds to the scatter of vertices, measured [px]."""
 _STRIDE = 0.5
 """Largest move of a vertex in one step [px]."""
 _KERNEL = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
@@ -94,9 +82,10 @@ class Ring:
     coast : ndarray of bool, shape (K,)
         Which vertices are seen to lie on a coast: not on the frame, nor near a cloud.
     sigma : float
-        Standard deviation of a vertex across the coast, by the noise of pixels [px]. Neighbors
-        within some 3 px share it: moments of the ring have more noise than `moment_noise` says for
-        independent vertices (see `gray_moments`). Capes and bays of a pixel are rounded besides.
+        Standard deviation of a vertex across the coast, to some 20 percent [px]: by the noise of
+        pixels, and 0.03 px by the rounding of small capes. Neighbors within some 3 px share it:
+        moments of the ring have more noise than `moment_noise` says for independent vertices (see
+        `gray_moments`).
     island : bool
     """
 
@@ -179,7 +168,7 @@ def coastline(
     for name, value in (("blur", blur), ("margin", margin), ("smallest", smallest)):
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{name} is finite and 0 or more, got {value}")
-    f, noise, gain, cloud = _coverage(_image(image), blur)
+    f, noise, cloud = _coverage(_image(image), blur)
     hidden = _dilated(cloud, margin)
     found = [ring for ring in _contours(f) if abs(_area(ring)) >= max(smallest, 1e-9)]
     water = [ring for ring in found if _area(ring) > 0]
@@ -192,6 +181,13 @@ def coastline(
     near = _nearby(found, f, hidden, _reach(blur))
     coasts = [_coast(ring, hidden) for ring in found]
     rings = _fitted(found, coasts, f, near, blur)
+    # the brightness of water again, now that it is known how much land is in it
+    inner = blurred(ring_coverage(rings, width, height), blur)[~hidden]
+    weight = np.where(inner >= min(_INNER, np.partition(inner, -_DEEP)[-_DEEP]), inner, 0.0)
+    total = float(weight @ weight)
+    scale = float(weight @ f[~hidden]) / total
+    f, noise, gain = f / scale, noise / scale, noise / scale / total**0.5
+    rings = _fitted(rings, coasts, f, near, blur)
     band = np.zeros(f.shape, np.bool_)
     band[near.row, near.column] = True
     covered = ring_coverage(rings, width, height)
@@ -299,8 +295,8 @@ def _image(image: ArrayLike, least: int = _SMALLEST_IMAGE) -> FloatArray:
     return a
 
 
-def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, float, Mask]:
-    """Coverage by water, standard deviations of it and of its factor, and where clouds are."""
+def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
+    """Coverage by water, its standard deviation, and where clouds are."""
     land = _land(image)
     if not land.min() > 0:
         raise ValueError(
@@ -308,7 +304,11 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, float,
             "  remove a dark offset from the image, but no more than that"
         )
     ratio = image / land
-    spread = 1.4826 * float(np.median(np.abs(ratio - 1)))
+    off = np.abs(ratio - 1)
+    spread = 1.4826 * float(np.median(off))
+    for _ in range(_ROUNDS):  # what is not land widens the median
+        kept = off[off <= _TRIM * spread]
+        spread = float(np.sqrt(np.mean(kept**2))) / _TRIMMED if len(kept) else 0.0
     dark = float(np.quantile(ratio, min(1.0, 4 / ratio.size)))
     floor = max(_DARK * spread, 1e-6)
     if 1 - dark < floor:
@@ -319,14 +319,15 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, float,
     q = dark
     for _ in range(_ROUNDS):
         water = ratio < (1 + q) / 2
-        inner = binary_erosion(water, iterations=1 + int(np.ceil(2 * blur)))
-        inner = inner if inner.sum() >= 9 else water
+        for depth in range(int(np.ceil(0.5 + 3.5 * blur)), 0, -1):
+            inner = binary_erosion(water, iterations=depth)
+            if inner.sum() >= _DEEP:
+                break
+        else:
+            inner = water
         before, q = q, float(np.median(ratio[inner]))
         if before == q:
             break
-    dark_pixels = ratio[inner]
-    near = np.abs(dark_pixels - q) <= max(_TRIM_WATER * spread, 0.01 * (1 - q))
-    q, n_water = float(dark_pixels[near].mean()), int(near.sum())
     if 1 - q < floor:
         raise ValueError(
             f"an image shows water, {_DARK:g} standard deviations or more darker than land; what "
@@ -337,7 +338,7 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, float,
     marks, n = label(cloud, np.ones((3, 3)))
     large = np.bincount(marks.ravel(), minlength=n + 1) >= _SPECK
     large[0] = False
-    return (1 - ratio) / (1 - q), noise, noise / n_water**0.5, large[marks]
+    return (1 - ratio) / (1 - q), noise, large[marks]
 
 
 def _land(image: FloatArray) -> FloatArray:
@@ -423,11 +424,12 @@ def _smooth(values: FloatArray) -> FloatArray:
 
 def _vertex_noise(ring: FloatArray, noise: float, blur: float) -> float:
     """Of a vertex across the coast [px]: of the contour's two pixels, and of those that move it."""
-    slope = 1 / np.sqrt(2 * np.pi * (blur**2 + 1 / 12))  # of a straight coast's coverage
+    # a straight coast's coverage, by the point spread, a pixel's square and interpolation
+    slope = 1 / np.sqrt(2 * np.pi * (blur**2 + 1 / 6))
     contour = np.sqrt(2 / 3) / slope
     length = float(np.hypot(*(np.roll(ring, -1, axis=0) - ring).T).mean())
     shared = length * _KERNEL.sum() ** 2 / (_KERNEL**2).sum()
-    return noise * float(np.sqrt(contour**2 + 2 * _reach(blur) / shared))
+    return float(np.hypot(noise * np.sqrt(contour**2 + 2 * _reach(blur) / shared), _ROUNDED))
 
 
 def _reach(blur: float) -> float:
