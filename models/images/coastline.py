@@ -34,10 +34,11 @@ import shapely
 from contourpy import FillType, contour_generator
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, label
+from scipy.special import ndtr
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.images.polygons import distances
-from terrafix.models.images.rendering import blurred, ring_coverage
+from terrafix.models.images.rendering import ring_coverage
 
 Mask = NDArray[np.bool_]
 """Which pixels, or vertices."""
@@ -51,8 +52,8 @@ _DEEP = 25
 """Pixels away from the coast that water's brightness is taken from; else of those nearer to it."""
 _INNER = 0.99
 """Coverage by the contour's own, of pixels that it is taken from when there is a contour."""
-_TRIMMED = 0.9546
-"""Standard deviation of a standard normal variable within `_TRIM`."""
+_STEPS_OF_CODES = 1.5
+"""What is added to that, in steps between codes: noise may be less than a step."""
 _DARK = 6.0
 """How far water must be below land, in its standard deviations."""
 _BRIGHT, _BRIGHTER = 5.0, 0.15
@@ -182,7 +183,7 @@ def coastline(
     coasts = [_coast(ring, hidden) for ring in found]
     rings = _fitted(found, coasts, f, near, blur)
     # the brightness of water again, now that it is known how much land is in it
-    inner = blurred(ring_coverage(rings, width, height), blur)[~hidden]
+    inner = ring_coverage(rings, width, height, blur)[~hidden]
     weight = np.where(inner >= min(_INNER, np.partition(inner, -_DEEP)[-_DEEP]), inner, 0.0)
     total = float(weight @ weight)
     scale = float(weight @ f[~hidden]) / total
@@ -297,7 +298,9 @@ def _image(image: ArrayLike, least: int = _SMALLEST_IMAGE) -> FloatArray:
 
 def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
     """Coverage by water, its standard deviation, and where clouds are."""
-    land = _land(image)
+    codes = np.unique(image)
+    step = float(np.diff(codes).min()) if len(codes) > 1 else 0.0
+    land = _land(image, step)
     if not land.min() > 0:
         raise ValueError(
             f"land is brighter than 0 all over an image, here it falls to {land.min():g}\n"
@@ -306,9 +309,13 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
     ratio = image / land
     off = np.abs(ratio - 1)
     spread = 1.4826 * float(np.median(off))
+    least = _STEPS_OF_CODES * step / float(np.median(land))
     for _ in range(_ROUNDS):  # what is not land widens the median
-        kept = off[off <= _TRIM * spread]
-        spread = float(np.sqrt(np.mean(kept**2))) / _TRIMMED if len(kept) else 0.0
+        most = _TRIM * spread + least
+        kept = off[off <= most]
+        a = most / max(spread, 1e-12)
+        lost = 2 * a * np.exp(-a * a / 2) / np.sqrt(2 * np.pi) / (2 * ndtr(a) - 1) if a else 0.0
+        spread = float(np.sqrt(np.mean(kept**2) / (1 - lost))) if len(kept) else 0.0
     dark = float(np.quantile(ratio, min(1.0, 4 / ratio.size)))
     floor = max(_DARK * spread, 1e-6)
     if 1 - dark < floor:
@@ -341,7 +348,7 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
     return (1 - ratio) / (1 - q), noise, large[marks]
 
 
-def _land(image: FloatArray) -> FloatArray:
+def _land(image: FloatArray, step: float) -> FloatArray:
     """Brightness of land: a plane through what is neither darker nor brighter than most."""
     y, x = (np.linspace(-1, 1, n) for n in image.shape)
     planes = np.stack([np.ones(image.size), np.tile(x, len(y)), np.repeat(y, len(x))], axis=1)
@@ -349,7 +356,8 @@ def _land(image: FloatArray) -> FloatArray:
     fit = np.full(values.shape, np.median(values))
     for _ in range(_ROUNDS):
         off = np.abs(values - fit)
-        keep = off <= max(_TRIM * 1.4826 * float(np.median(off)), 1e-9 * float(np.abs(fit).max()))
+        most = _TRIM * 1.4826 * float(np.median(off)) + _STEPS_OF_CODES * step
+        keep = off <= max(most, 1e-9 * float(np.abs(fit).max()))
         part = planes[keep]
         after = planes @ np.linalg.lstsq(part.T @ part, part.T @ values[keep], rcond=None)[0]
         done = np.abs(after - fit).max() <= 1e-12 * np.abs(after).max()
@@ -394,7 +402,7 @@ def _fitted(
     height, width = f.shape
     moved = rings
     for _ in range(_STEPS):
-        covered = blurred(ring_coverage(moved, width, height), blur)
+        covered = ring_coverage(moved, width, height, blur)
         excess = (f - covered)[near.row, near.column]
         after = []
         for k, (ring, coast) in enumerate(zip(moved, coasts, strict=True)):

@@ -13,7 +13,6 @@ from terrafix.models.images.coastline import coastline, gray_moments
 from terrafix.models.images.polygons import distances, moments
 from terrafix.models.images.rendering import (
     Appearance,
-    blurred,
     cloud_opacity,
     render_polygon,
     render_scene,
@@ -29,9 +28,7 @@ def bay(shift=(0.0, 0.0)):
     x = np.linspace(-88, 88, 30)
     middle = 8 * np.sin(x / 30) + 0.08 * x
     half = 4.2 + 2.5 * np.sin(x / 11) * np.cos(x / 29) * (1 - (x / 88) ** 6)
-    ring = np.concatenate(
-        [np.stack([x, middle - half], 1), np.stack([x, middle + half], 1)[::-1]]
-    )
+    ring = np.concatenate([np.stack([x, middle - half], 1), np.stack([x, middle + half], 1)[::-1]])
     return ring + np.array([160.0, 128.0]) + np.array(shift)
 
 
@@ -51,7 +48,7 @@ LAKES = {"bay": bay, "seneca": seneca}
 def camera(ring, blur, n=8):
     """Coverage through a continuous Gaussian and a pixel's square, n x n samples to a pixel.
 
-    An independent way: `blurred` convolves at whole pixels.
+    An independent way: finer, and with a Gaussian that is sampled.
     """
     fine = render_polygon((ring + 0.5) * n - 0.5, n * WIDTH, n * HEIGHT)
     fine = gaussian_filter(fine, n * blur, truncate=6) if blur else fine
@@ -119,10 +116,9 @@ def test_light_may_vary_and_codes_may_be_coarse():
     """A plane of light is taken out exactly: the same area to rounding, or to 8 bits."""
     ring = bay((0.2, 0.3))
     m, _ = moments(ring)
-    f = blurred(render_polygon(ring, WIDTH, HEIGHT), 0.7)
+    f = render_polygon(ring, WIDTH, HEIGHT, blur=0.7)
     for gradient in ((0.0, 0.0), (0.6, -0.4), (-0.5, 0.5)):
         look = Appearance(bits=0, gradient=gradient)
-        # light falls before the point spread here, as in render_scene
         fit, gray, _, _ = measured(render_scene(f, look, RNG(0)), 0.7)
         for got in (fit, gray):
             assert abs(got[0] / m[0] - 1) < 1e-4
@@ -152,7 +148,7 @@ def test_noise_is_as_stated(blur, noise):
     for _ in range(n):
         ring = bay(placed(rng) - np.array([60, 92]))
         m, _ = moments(ring)
-        f = blurred(render_polygon(ring, 200, 72), blur)
+        f = render_polygon(ring, 200, 72, blur=blur)
         fit, gray, P, c = measured(seen(f, noise, rng), blur)
         fits.append(fit - m)
         grays.append(gray - m)
@@ -177,7 +173,7 @@ def test_gray_moments_of_a_rectangle(blur):
     got = []
     for i in range(n):
         for j in range(n):
-            f = blurred(render_polygon(corners + [14 + i / n, 13 + j / n], 40, 30), blur)
+            f = render_polygon(corners + np.array([14 + i / n, 13 + j / n]), 40, 30, blur=blur)
             m, P, bias = gray_moments(f, blur=blur)
             got.append(m - [0, i / n, j / n, 0, 0, 0])
     assert not P.any()
@@ -192,15 +188,14 @@ def test_gray_moments_of_a_rectangle(blur):
 def test_noise_of_gray_moments_is_that_of_monte_carlo():
     """8000 draws of noise in a band and of a shared factor, within 4.5 standard errors."""
     f = render_polygon(bay((-110, -110)) * 0.3 + np.array([5.0, 8.0]), 60, 30)
-    band = (blurred(f, 0.7) > 1e-3) & (blurred(f, 0.7) < 1 - 1e-3)
+    smooth = gaussian_filter(f, 0.7)
+    band = (smooth > 1e-3) & (smooth < 1 - 1e-3)
     rng, n, sigma, gain = RNG(2), 8000, 0.05, 0.01
     m, P, bias = gray_moments(f, sigma, band, gain=gain)
     drawn = np.array(
         [
             gray_moments(
-                f
-                + band
-                * (sigma * rng.standard_normal(f.shape) + gain * rng.standard_normal() * f)
+                f + band * (sigma * rng.standard_normal(f.shape) + gain * rng.standard_normal() * f)
             )[0]
             for _ in range(n)
         ]
@@ -260,9 +255,9 @@ def test_edges_of_clouds_are_no_coast():
     judged = cut = 0
     for seed in range(8):
         ring = bay(placed(RNG(seed)))
-        f = render_polygon(ring, WIDTH, HEIGHT)
+        f = render_polygon(ring, WIDTH, HEIGHT, blur=0.7)
         alpha = cloud_opacity(WIDTH, HEIGHT, 0.25, RNG(100 + seed))
-        look = Appearance(blur=0.7, noise=0.002, gradient=(0.2, 0.1))
+        look = Appearance(noise=0.002, gradient=(0.2, 0.1))
         c = coastline(render_scene(f, look, RNG(seed), alpha), blur=0.7)
         assert c.hidden[alpha > 0.3].all()
         assert not (c.mask & (alpha > 0.3)).any()
@@ -278,7 +273,7 @@ def test_edges_of_clouds_are_no_coast():
 def test_clouds_off_the_lake_do_no_harm():
     ring = bay()
     m, _ = moments(ring)
-    f = blurred(render_polygon(ring, WIDTH, HEIGHT), 0.7)
+    f = render_polygon(ring, WIDTH, HEIGHT, blur=0.7)
     alpha = cloud_opacity(WIDTH, HEIGHT, 0.3, RNG(1))
     alpha[80:180] = 0
     image = render_scene(f, Appearance(bits=0), RNG(0), alpha)

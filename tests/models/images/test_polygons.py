@@ -48,7 +48,7 @@ def turned(ring, angle):
 def test_moments_of_a_rectangle():
     """b^2/12 and h^2/12 about the middle; the closed form, turned by 30 deg too."""
     ring = np.array([[0, 0], [6, 0], [6, 2], [0, 2]], float)
-    m, _ = moments(ring + [10, 20])
+    m, _ = moments(ring + np.array([10, 20]))
     np.testing.assert_allclose(m, [12, 13, 21, 3, 1 / 3, 0], atol=1e-13)
     c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
     m, _ = moments(turned(ring, np.pi / 6))

@@ -5,6 +5,7 @@ from time import process_time
 import numpy as np
 import pytest
 import shapely
+from scipy.special import ndtr
 
 from terrafix.models.images.polygons import clip_to_frame, moments
 from terrafix.models.images.rendering import (
@@ -101,7 +102,7 @@ RNG = np.random.default_rng
 
 
 def test_reflectances_and_light():
-    """Without blur, noise and codes: light times reflectance, by hand."""
+    """Without noise and codes: light times reflectance, by hand."""
     f = np.array([[0.0, 1.0, 0.5], [0.0, 0.0, 1.0], [0.25, 0.0, 0.0]])
     look = Appearance(water=0.1, land=0.3, bits=0, gradient=(0.4, -0.2))
     image = render_scene(f, look, RNG(0))
@@ -110,16 +111,41 @@ def test_reflectances_and_light():
 
 
 def test_the_point_spread_keeps_the_sum_and_adds_its_variance():
-    f = render_polygon(lake(40, 12.0, (40, 30)), 80, 60)
+    ring = lake(40, 12.0, (40, 30))
+    f = render_polygon(ring, 80, 60)
     y, x = np.mgrid[:60, :80]
 
     def spread(g):
         return [(g * (a - (g * a).sum() / g.sum()) ** 2).sum() / g.sum() for a in (x, y)]
 
-    for blur in (0.2, 0.7, 1.5):
-        g = render_scene(f, Appearance(water=1.0, land=0.0, blur=blur, bits=0), RNG(0))
+    for blur in (0.3, 0.7, 1.5):
+        g = render_polygon(ring, 80, 60, blur=blur)
         assert g.sum() == pytest.approx(f.sum(), rel=1e-9)
-        np.testing.assert_allclose(np.subtract(spread(g), spread(f)), blur**2, rtol=1e-9)
+        # pixels of f hold other harmonics than those of g: 0.01 px^2
+        np.testing.assert_allclose(np.subtract(spread(g), spread(f)), blur**2, atol=0.01)
+
+
+@pytest.mark.parametrize("blur", [0.5, 0.7, 1.2])
+def test_the_point_spread_of_a_straight_edge(blur):
+    """An error function, averaged over pixels: the closed form, as two of its integrals."""
+    edge = 20.3
+    g = render_polygon([[-90, -90], [edge, -90], [edge, 90], [-90, 90]], 40, 12, blur=blur)
+
+    def integral(x):  # of the normal distribution function
+        return x * ndtr(x / blur) + blur * np.exp(-((x / blur) ** 2) / 2) / np.sqrt(2 * np.pi)
+
+    x = np.arange(40)
+    expected = integral(edge - x + 0.5) - integral(edge - x - 0.5)
+    # trapezoidal rule at half of blur, across a kink: (blur / 2)^2 / 12 of 0.4 / blur at most
+    np.testing.assert_allclose(g, np.broadcast_to(expected, g.shape), atol=5e-3)
+
+
+def test_the_point_spread_sees_beyond_the_border():
+    ring = lake(40, 12.0, (30, 20))
+    whole = render_polygon(ring, 70, 50, blur=0.7)
+    part = render_polygon(ring - np.array([22, 14]), 16, 12, blur=0.7)
+    np.testing.assert_allclose(part, whole[14:26, 22:38], atol=1e-9)
+    assert not render_polygon(ring + 500, 16, 12, blur=0.7).any()
 
 
 def test_noise_and_codes():
@@ -139,7 +165,7 @@ def test_noise_and_codes():
 
 def test_the_same_seed_gives_the_same_image():
     f = render_polygon(lake(), 320, 256)
-    images = [render_scene(f, Appearance(noise=0.01, blur=0.7), RNG(k)) for k in (3, 3, 4)]
+    images = [render_scene(f, Appearance(noise=0.01), RNG(k)) for k in (3, 3, 4)]
     np.testing.assert_array_equal(images[0], images[1])
     assert (images[0] != images[2]).any()
 
@@ -171,6 +197,7 @@ def test_clouds_cover_their_share_and_hide_what_is_below():
         (lambda: render_polygon([[0, 0], [2, 2]], 9, 9), "three vertices or more, got 2"),
         (lambda: render_polygon(lake(), 9, 0), "one pixel or more along each side, got 9 x 0"),
         (lambda: render_polygon(lake(), 9, 9, [[[0, np.nan], [1, 1], [1, 0]]]), "got a NaN"),
+        (lambda: render_polygon(lake(), 9, 9, blur=-1), "blur is 0 px or more, got -1"),
         (lambda: Appearance(noise=-1), "noise must be 0 or more, got -1"),
         (lambda: Appearance(full_scale=0), "full_scale must be positive, got 0"),
         (lambda: Appearance(gradient=(1.5, 0.6)), "light in every corner"),
