@@ -42,7 +42,7 @@ NAVIGATION = {
 }
 LATE = (
     "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy "
-    "psutil filelock platformdirs tomlkit jinja2"
+    "psutil filelock platformdirs tomlkit jinja2 shapely contourpy"
 )
 HEAVY = {
     "terrafix": f"numpy click {LATE}",

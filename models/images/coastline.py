@@ -12,28 +12,10 @@ and the ends of a long lake count most in second moments. So it is moved along i
 own coverage, exact (`rendering`) and blurred by the point spread, is the image's: in each of some
 steps a vertex moves by what the image has more than the contour near it, per length.
 
-Biases, noise-free, for the outline of Lake Seneca at 176 x 33 px (1691 px^2), over 30 places and
-angles; the largest for area, else the mean:
-
-============================  ==========  ==========  ==========  ==========
-estimator                     A [%]       A, blur     mxx [px^2]  mxx, blur
-                              sharp       0.7 px      sharp       0.7 px
-============================  ==========  ==========  ==========  ==========
-fillPoly, findContours        -10.1       .           .           .
-findContours, 8 x enlarged    -1.3        .           .           .
-contourpy, scikit-image       0.17        0.21        -2.1        -5.7
-here: contour, fitted         0.0007      0.0010      0.01        0.004
-gray moments                  < 1e-4      < 1e-4      0.0004      -0.001
-============================  ==========  ==========  ==========  ==========
-
-contourpy (which matplotlib brings) and scikit-image's ``find_contours`` give the same contours to
-rounding. With noise of 1 % (of the contrast between water and land) in every pixel, standard
-deviations of (A, x, y, mxx, myy, mxy) are (0.30, 0.013, 0.002, 0.46, 0.018, 0.07) by the fitted
-contour and (0.30, 0.013, 0.002, 0.46, 0.020, 0.07) by gray moments in a band of the same width; at
-5 % five times that. Both are as good: gray moments come with a covariance, the contour with a shape.
-
+TABLE
 Excluded as no coast: what lies near clouds, that is near pixels brighter than land, and the frame.
-A thin cloud over water that is nowhere brighter than land is not told from land.
+A thin cloud over water that is nowhere brighter than land is not told from land. Arms of water that
+are narrower than a pixel, which nowhere cover half of one, are lost, to gray moments too.
 
 Coordinates are those of `polygons`: (x, y), whole at the centers of pixels.
 
@@ -45,12 +27,14 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
 from contourpy import FillType, contour_generator
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label
+from scipy.ndimage import binary_dilation, binary_erosion, label
+from scipy.special import ndtr
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.images.polygons import distances
@@ -64,6 +48,12 @@ _SMALLEST_IMAGE = 8
 _ROUNDS = 30
 _TRIM = 2.5
 """Residuals of land, in its standard deviations, beyond which something is not land."""
+_DEEP = 25
+"""Pixels away from the coast that water's brightness is taken from; else of those nearer to it."""
+_INNER = 0.99
+"""Coverage by the contour's own, of pixels that it is taken from when there is a contour."""
+_STEPS_OF_CODES = 1.5
+"""What is added to that, in steps between codes: noise may be less than a step."""
 _DARK = 6.0
 """How far water must be below land, in its standard deviations."""
 _BRIGHT, _BRIGHTER = 5.0, 0.15
@@ -71,6 +61,10 @@ _BRIGHT, _BRIGHTER = 5.0, 0.15
 _SPECK = 3
 """Pixels that a cloud must have."""
 _STEPS = 4
+_ROUNDED = 0.03
+"""What rounding off capes and bays of a pixel adds to the scatter of vertices, measured [px]."""
+_STRIDE = 0.5
+"""Largest move of a vertex in one step [px]."""
 _KERNEL = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
 """Smoothing of vertices' moves along the contour."""
 _SIDES = 1e-9
@@ -88,16 +82,17 @@ class Ring:
         y to x around an island.
     coast : ndarray of bool, shape (K,)
         Which vertices are seen to lie on a coast: not on the frame, nor near a cloud.
-    sigma : ndarray, shape (K,)
-        Standard deviation of each across the coast, by the noise of pixels [px]. It is shared
-        by neighbors within some 3 px: moments of the ring have more noise than `moment_noise` says
-        for independent ones; see `gray_moments`.
+    sigma : float
+        Standard deviation of a vertex across the coast, to some 20 percent [px]: by the noise of
+        pixels, and 0.03 px by the rounding of small capes. Neighbors within some 3 px share it:
+        moments of the ring have more noise than `moment_noise` says for independent vertices (see
+        `gray_moments`).
     island : bool
     """
 
     vertices: FloatArray
     coast: Mask
-    sigma: FloatArray
+    sigma: float
     island: bool
 
     @property
@@ -123,7 +118,9 @@ class Coastline:
     hidden : ndarray of bool, shape (height, width)
         Clouds, and what is near them.
     noise : float
-        Standard deviation of `coverage` within the band [-].
+        Standard deviation of `coverage` of each pixel of the band, independent [-].
+    gain : float
+        That of a factor that all of the band shares, by the brightness of water [-].
     """
 
     rings: tuple[Ring, ...]
@@ -132,6 +129,18 @@ class Coastline:
     band: Mask
     hidden: Mask
     noise: float
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Nearby:
+    """Pixels near rings, and which ring, segment and place on it is nearest; each (n,)."""
+
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+    ring: NDArray[np.intp]
+    segment: NDArray[np.intp]
+    parameter: FloatArray
 
 
 def coastline(
@@ -170,18 +179,26 @@ def coastline(
             "large\n  lower smallest, or take an image with the whole lake in it"
         )
     height, width = f.shape
-    reach = 1.5 + 2.5 * blur
-    band = _dilated(_border(f), reach) & ~hidden
+    near = _nearby(found, f, hidden, _reach(blur))
     coasts = [_coast(ring, hidden) for ring in found]
-    rings = _fitted(found, coasts, f, band, blur, reach)
+    rings = _fitted(found, coasts, f, near, blur)
+    # the brightness of water again, now that it is known how much land is in it
+    inner = ring_coverage(rings, width, height, blur)[~hidden]
+    weight = np.where(inner >= min(_INNER, np.partition(inner, -_DEEP)[-_DEEP]), inner, 0.0)
+    total = float(weight @ weight)
+    scale = float(weight @ f[~hidden]) / total
+    f, noise, gain = f / scale, noise / scale, noise / scale / total**0.5
+    rings = _fitted(rings, coasts, f, near, blur)
+    band = np.zeros(f.shape, np.bool_)
+    band[near.row, near.column] = True
     covered = ring_coverage(rings, width, height)
     f = np.where(band, f, np.where(covered > 0.5, 1.0, 0.0))
     made = [
-        Ring(ring, coast, np.full(len(ring), _vertex_noise(ring, noise, reach)), _area(ring) < 0)
+        Ring(ring, coast, _vertex_noise(ring, noise, blur), _area(ring) < 0)
         for ring, coast in zip(rings, coasts, strict=True)
     ]
     made.sort(key=lambda ring: -abs(_area(ring.vertices)))
-    return Coastline(tuple(made), (f >= 0.5) & ~hidden, f, band, hidden, noise)
+    return Coastline(tuple(made), (f >= 0.5) & ~hidden, f, band, hidden, noise, gain)
 
 
 def gray_moments(
@@ -189,6 +206,7 @@ def gray_moments(
     sigma: float = 0.0,
     band: ArrayLike | None = None,
     *,
+    gain: float = 0.0,
     blur: float = 0.0,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     r"""Moments straight from the coverage of pixels, without a contour.
@@ -213,6 +231,8 @@ def gray_moments(
         Standard deviation of the coverage of each pixel of `band` [-].
     band : array_like of bool, shape (height, width)
         Pixels that hold noise; all, if it is left out.
+    gain : float
+        Standard deviation of a factor that the coverage of all of `band` shares [-].
     blur : float
         Standard deviation of the Gaussian point spread [px].
 
@@ -229,11 +249,11 @@ def gray_moments(
     ------
     ValueError
         If `coverage` is not a plane of finite numbers, its sum is not positive, `band` has another
-        shape, or `sigma` or `blur` is negative.
+        shape, or `sigma`, `gain` or `blur` is negative.
     """
     f = _image(coverage, 1)
-    if not (sigma >= 0 and blur >= 0):
-        raise ValueError(f"sigma and blur are 0 or more, got {sigma} and {blur} px")
+    if not (sigma >= 0 and gain >= 0 and blur >= 0):
+        raise ValueError(f"sigma, gain and blur are 0 or more, got {sigma}, {gain} and {blur} px")
     noisy = np.ones(f.shape, np.bool_) if band is None else np.asarray(band, np.bool_)
     if noisy.shape != f.shape:
         raise ValueError(f"a band has the shape of the coverage, {f.shape}, got {noisy.shape}")
@@ -254,7 +274,8 @@ def gray_moments(
     trace = np.zeros(6)
     trace[1:] = -2 / area * J[1:].sum(axis=1)
     trace[3:] -= 2 * np.array([products[0, 0], products[1, 1], products[0, 1]])
-    return m, sigma**2 * J @ J.T, sigma**2 / 2 * trace
+    shared = gain * J @ f[rows, columns][n]
+    return m, sigma**2 * J @ J.T + np.outer(shared, shared), sigma**2 / 2 * trace
 
 
 def _image(image: ArrayLike, least: int = _SMALLEST_IMAGE) -> FloatArray:
@@ -277,14 +298,24 @@ def _image(image: ArrayLike, least: int = _SMALLEST_IMAGE) -> FloatArray:
 
 def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
     """Coverage by water, its standard deviation, and where clouds are."""
-    land = _land(image)
+    codes = np.unique(image)
+    step = float(np.diff(codes).min()) if len(codes) > 1 else 0.0
+    land = _land(image, step)
     if not land.min() > 0:
         raise ValueError(
             f"land is brighter than 0 all over an image, here it falls to {land.min():g}\n"
             "  remove a dark offset from the image, but no more than that"
         )
     ratio = image / land
-    spread = 1.4826 * float(np.median(np.abs(ratio - 1)))
+    off = np.abs(ratio - 1)
+    spread = 1.4826 * float(np.median(off))
+    least = _STEPS_OF_CODES * step / float(np.median(land))
+    for _ in range(_ROUNDS):  # what is not land widens the median
+        most = _TRIM * spread + least
+        kept = off[off <= most]
+        a = most / max(spread, 1e-12)
+        lost = 2 * a * np.exp(-a * a / 2) / np.sqrt(2 * np.pi) / (2 * ndtr(a) - 1) if a else 0.0
+        spread = float(np.sqrt(np.mean(kept**2) / (1 - lost))) if len(kept) else 0.0
     dark = float(np.quantile(ratio, min(1.0, 4 / ratio.size)))
     floor = max(_DARK * spread, 1e-6)
     if 1 - dark < floor:
@@ -295,8 +326,12 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
     q = dark
     for _ in range(_ROUNDS):
         water = ratio < (1 + q) / 2
-        inner = binary_erosion(water, iterations=1 + int(np.ceil(2 * blur)))
-        inner = inner if inner.sum() >= 9 else water
+        for depth in range(int(np.ceil(0.5 + 3.5 * blur)), 0, -1):
+            inner = binary_erosion(water, iterations=depth)
+            if inner.sum() >= _DEEP:
+                break
+        else:
+            inner = water
         before, q = q, float(np.median(ratio[inner]))
         if before == q:
             break
@@ -305,14 +340,15 @@ def _coverage(image: FloatArray, blur: float) -> tuple[FloatArray, float, Mask]:
             f"an image shows water, {_DARK:g} standard deviations or more darker than land; what "
             f"is dark in this one is {(1 - q) / max(spread, 1e-9):.1f} darker"
         )
+    noise = spread / (1 - q)
     cloud = ratio > 1 + max(_BRIGHT * spread, _BRIGHTER * (1 - q))
     marks, n = label(cloud, np.ones((3, 3)))
     large = np.bincount(marks.ravel(), minlength=n + 1) >= _SPECK
     large[0] = False
-    return (1 - ratio) / (1 - q), spread / (1 - q), large[marks]
+    return (1 - ratio) / (1 - q), noise, large[marks]
 
 
-def _land(image: FloatArray) -> FloatArray:
+def _land(image: FloatArray, step: float) -> FloatArray:
     """Brightness of land: a plane through what is neither darker nor brighter than most."""
     y, x = (np.linspace(-1, 1, n) for n in image.shape)
     planes = np.stack([np.ones(image.size), np.tile(x, len(y)), np.repeat(y, len(x))], axis=1)
@@ -320,7 +356,8 @@ def _land(image: FloatArray) -> FloatArray:
     fit = np.full(values.shape, np.median(values))
     for _ in range(_ROUNDS):
         off = np.abs(values - fit)
-        keep = off <= max(_TRIM * 1.4826 * float(np.median(off)), 1e-9 * float(np.abs(fit).max()))
+        most = _TRIM * 1.4826 * float(np.median(off)) + _STEPS_OF_CODES * step
+        keep = off <= max(most, 1e-9 * float(np.abs(fit).max()))
         part = planes[keep]
         after = planes @ np.linalg.lstsq(part.T @ part, part.T @ values[keep], rcond=None)[0]
         done = np.abs(after - fit).max() <= 1e-12 * np.abs(after).max()
@@ -336,7 +373,7 @@ def _contours(f: FloatArray) -> list[FloatArray]:
     generator = contour_generator(x, y, np.pad(f, 1, mode="edge"), fill_type=FillType.OuterOffset)
     rings = []
     for points, offsets in zip(*generator.filled(0.5, np.inf), strict=True):
-        for k, (first, last) in enumerate(zip(offsets[:-1], offsets[1:], strict=True)):
+        for k, (first, last) in enumerate(pairwise(offsets)):
             ring = np.asarray(points[first : last - 1], np.float64)
             ring = ring[np.abs(ring - np.roll(ring, 1, axis=0)).max(axis=1) > 0]
             if len(ring) >= 3:
@@ -344,31 +381,34 @@ def _contours(f: FloatArray) -> list[FloatArray]:
     return rings
 
 
+def _nearby(rings: list[FloatArray], f: FloatArray, hidden: Mask, reach: float) -> _Nearby:
+    """Pixels within reach of a ring that are not hidden."""
+    rows, columns = np.nonzero(_dilated(_border(f), reach) & ~hidden)
+    pixels = np.stack([columns, rows], axis=1).astype(np.float64)
+    found = [distances(pixels, ring) for ring in rings]
+    apart = np.stack([n.distance for n in found])
+    ring = apart.argmin(axis=0)
+    k = np.arange(len(ring))
+    segment = np.stack([n.segment for n in found])[ring, k]
+    parameter = np.stack([n.parameter for n in found])[ring, k]
+    seen = apart[ring, k] < reach
+    return _Nearby(rows[seen], columns[seen], ring[seen], segment[seen], parameter[seen])
+
+
 def _fitted(
-    rings: list[FloatArray],
-    coasts: list[Mask],
-    f: FloatArray,
-    band: Mask,
-    blur: float,
-    reach: float,
+    rings: list[FloatArray], coasts: list[Mask], f: FloatArray, near: _Nearby, blur: float
 ) -> list[FloatArray]:
     """Move rings until their coverage is f; one that would cross itself stays as it was."""
-    rows, columns = np.nonzero(band)
-    pixels = np.stack([columns, rows], axis=1).astype(np.float64)
     height, width = f.shape
     moved = rings
     for _ in range(_STEPS):
-        covered = ring_coverage(moved, width, height)
-        if blur > 0:
-            covered = gaussian_filter(covered, blur, mode="nearest")
-        excess = (f - covered)[rows, columns]
-        near = [distances(pixels, ring) for ring in moved]
-        owner = np.argmin([n.distance for n in near], axis=0)
+        covered = ring_coverage(moved, width, height, blur)
+        excess = (f - covered)[near.row, near.column]
         after = []
-        for k, (ring, coast, n) in enumerate(zip(moved, coasts, near, strict=True)):
-            own = (owner == k) & (n.distance < reach)
-            i, t, count = n.segment[own], n.parameter[own], len(ring)
-            share = np.bincount(i, excess[own] * (1 - t), count)
+        for k, (ring, coast) in enumerate(zip(moved, coasts, strict=True)):
+            own, count = near.ring == k, len(ring)
+            i, t = near.segment[own], near.parameter[own]
+            share = np.bincount(i, excess[own] * (1 - t), count).astype(np.float64)
             share += np.roll(np.bincount(i, excess[own] * t, count), 1)
             length = np.hypot(*(np.roll(ring, -1, axis=0) - ring).T)
             length = (length + np.roll(length, 1)) / 2
@@ -376,7 +416,7 @@ def _fitted(
             along = np.roll(ring, -1, axis=0) - np.roll(ring, 1, axis=0)
             long = np.maximum(np.hypot(*along.T), 1e-9)
             outward = np.stack([along[:, 1], -along[:, 0]], axis=1) / long[:, None]
-            after.append(ring + outward * np.clip(step, -0.5, 0.5)[:, None])
+            after.append(ring + outward * np.clip(step, -_STRIDE, _STRIDE)[:, None])
         moved = after
     return [
         new if shapely.is_valid(shapely.Polygon(new)) else old
@@ -390,11 +430,19 @@ def _smooth(values: FloatArray) -> FloatArray:
     return np.asarray(np.sum(parts, axis=0))
 
 
-def _vertex_noise(ring: FloatArray, noise: float, reach: float) -> float:
-    """Of a vertex across the coast [px]: of the pixels that share in its move, per length."""
+def _vertex_noise(ring: FloatArray, noise: float, blur: float) -> float:
+    """Of a vertex across the coast [px]: of the contour's two pixels, and of those that move it."""
+    # a straight coast's coverage, by the point spread, a pixel's square and interpolation
+    slope = 1 / np.sqrt(2 * np.pi * (blur**2 + 1 / 6))
+    contour = np.sqrt(2 / 3) / slope
     length = float(np.hypot(*(np.roll(ring, -1, axis=0) - ring).T).mean())
     shared = length * _KERNEL.sum() ** 2 / (_KERNEL**2).sum()
-    return noise * float(np.sqrt(2 * reach / shared))
+    return float(np.hypot(noise * np.sqrt(contour**2 + 2 * _reach(blur) / shared), _ROUNDED))
+
+
+def _reach(blur: float) -> float:
+    """How far from a coast pixels are fitted [px]."""
+    return 1.5 + 2 * blur
 
 
 def _coast(ring: FloatArray, hidden: Mask) -> Mask:

@@ -142,7 +142,7 @@ def moment_noise(vertices: ArrayLike, sigma: ArrayLike) -> tuple[FloatArray, Flo
     """
     variance = np.asarray(sigma, np.float64)
     if not (np.isfinite(variance).all() and (variance >= 0).all()):
-        raise ValueError(f"the noise of vertices is 0 px or more, got {sigma} px")
+        raise ValueError(f"the noise of vertices is 0 px or more, got {np.min(variance)}")
     variance = variance**2
     m, J, sums = _moments(vertices)
     flat = J.reshape(*J.shape[:-2], -1)
@@ -198,7 +198,8 @@ def clip_to_frame(vertices: ArrayLike, width: int, height: int) -> Clipped:
     frame = shapely.box(-0.5, -0.5, size[0] - 0.5, size[1] - 0.5)
     parts = shapely.get_parts(shapely.intersection(polygon, frame))
     rings, edges = [], []
-    for part in parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]:
+    areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & ~shapely.is_empty(parts)
+    for part in parts[areal]:
         ring = shapely.get_coordinates(part)[:-1]
         sides = np.concatenate([ring + 0.5, ring + 0.5 - np.array(size)], axis=1)
         on = np.abs(sides) < _ON_FRAME
@@ -303,7 +304,9 @@ def _moments(vertices: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     x, y, x1, y1, c = _edges(local)
     center = np.stack([((x + x1) * c).sum(-1), ((y + y1) * c).sum(-1)], -1) / (6 * area[..., None])
     x, y, x1, y1, c = _edges(local - center[..., None, :])
-    polynomials = (  # each, and its derivatives by x, y, x1, y1; and what the sum is divided by
+    polynomials: tuple[
+        tuple[Any, ...], ...
+    ] = (  # each, and its derivatives by x, y, x1, y1; and what the sum is divided by
         (np.ones_like(x), 0.0, 0.0, 0.0, 0.0, 2.0),
         (x + x1, 1.0, 0.0, 1.0, 0.0, 6.0),
         (y + y1, 0.0, 1.0, 0.0, 1.0, 6.0),
