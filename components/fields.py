@@ -114,6 +114,9 @@ MOST_VERTICES = 1024
 CONTOUR: dict[str, Any] = {"shape": (MOST_VERTICES, 2), "unit": "px", "ragged": True}
 """Vertices of the outline of a lake in an image, not closed."""
 
+FRAME: dict[str, Any] = {"shape": (256, 320)}
+"""An image of the camera that looks for lakes: rows, columns."""
+
 LOOK = {
     "lake": Field((), "1", doc="number of the lake in its catalog"),
     "sigma": Field((), "px", doc="of the noise of each coordinate of each vertex"),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.components.fields import CONTOUR, LOOK
+from terrafix.components.fields import CONTOUR, FRAME, LOOK
 from terrafix.components.filters.family import fix_fields
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
-from terrafix.cosim.declare.ports import MessageInput, MessageOutput
+from terrafix.cosim.declare.ports import MessageInput, MessageOutput, Output
 from terrafix.models.filters.lake import MOMENTS, ORBIT, lake_observation
+from terrafix.models.images.coastline import coastline, gray_moments
 from terrafix.models.images.polygons import moment_noise, moments
 
 ELEMENTS = {"six": 6, "three": 3}
@@ -63,3 +64,45 @@ class ContourMoments(Component):
         present = np.zeros((n, m))
         present[:, : ELEMENTS[self.elements]] = 1.0
         self.fix.publish(look.t, valid=good, y=y, R=R, lake=look.lake[:, None], present=present)
+
+
+class ImageMoments(Component):
+    """Moments of a lake from an image: of the coverage of its pixels by water, as measured.
+
+    An image with no water, or with clouds at the lake's shore, makes no fix.
+    """
+
+    default_rate = Rate("1/30")
+
+    blur = Parameter(0.5, unit="px", minimum=0.0, doc="the camera's point spread, as calibrated")
+
+    image = MessageInput(**FRAME, doc="codes of the pixels")
+    look = MessageInput(fields=LOOK, doc="which lake it is")
+    fix = MessageOutput(fields=fix_fields(lake_observation(ORBIT)), doc="its moments")
+    clear = Output(doc="1 where the shore was seen whole, 0 where not, NaN without an image")
+
+    def _initialize_impl(self) -> None:
+        self.clear = np.nan
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        n, m = self.n_members, len(MOMENTS)
+        y, R = np.zeros((n, m)), np.tile(np.eye(m), (n, 1, 1))
+        told = self.image.fresh & self.look.fresh & (self.look.whole > 0.5)
+        good = np.zeros(n, dtype=np.bool_)
+        for k in np.flatnonzero(told & self.environment.active):
+            blur = float(self.blur[k])
+            try:
+                seen = coastline(self.image.value[k], blur=blur)
+            except ValueError:  # no water in it
+                continue
+            lake = seen.rings[0]
+            if not lake.whole:
+                continue
+            y[k], R[k], bias = gray_moments(
+                seen.coverage, seen.noise, seen.band, gain=seen.gain, blur=blur
+            )
+            y[k] -= bias
+            good[k] = True
+        self.clear = np.where(self.image.fresh, good, np.nan)
+        lakes = self.look.lake[:, None]
+        self.fix.publish(self.look.t, valid=good, y=y, R=R, lake=lakes, present=np.ones((n, m)))

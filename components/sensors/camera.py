@@ -9,6 +9,7 @@ from terrafix.components.fields import (
     CENTERS,
     CONTOUR,
     CORNERS,
+    FRAME,
     LOOK,
     MOST_VERTICES,
     RADII,
@@ -19,13 +20,19 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.parameters import Choice, Parameter
-from terrafix.cosim.declare.ports import Input, MessageOutput, Output, SharedInput
+from terrafix.cosim.declare.parameters import Choice, Count, Parameter
+from terrafix.cosim.declare.ports import Input, MessageInput, MessageOutput, Output, SharedInput
 from terrafix.models.core.batch import over_members
 from terrafix.models.filters.lake import CAMERA, Seen
 from terrafix.models.filters.measurement import TIME
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import rotate_about_pole
+from terrafix.models.images.rendering import (
+    Appearance,
+    cloud_opacity,
+    render_polygon,
+    render_scene,
+)
 
 rotate_about_pole_array = over_members(rotate_about_pole, (), (3,))
 
@@ -99,7 +106,7 @@ class LakeCamera(Component):
             for number in np.unique(lakes[lakes >= 0]):
                 rows = np.flatnonzero((lakes == number) & (whole < 0.5))
                 pixels, inside = self._outline(number, rows, t)
-                complete = inside.all(axis=1)
+                complete: NDArray[np.bool_] = np.asarray(inside.all(axis=1))
                 taken = complete | ((count[rows] == 0) & inside.any(axis=1))
                 own, size = rows[taken], pixels.shape[1]
                 sigma = self.vertex_sigma[own, None, None]
@@ -144,3 +151,47 @@ class LakeCamera(Component):
 
 _NEAREST = 4
 """Lakes that are looked at in one frame."""
+
+
+class LakeImager(Component):
+    """Images of the lake whose outline a camera sees: coverage of pixels, blurred, lit, with noise.
+
+    Its camera gives outlines without noise. Land is all around.
+    """
+
+    default_rate = Rate("1/30")
+
+    blur = Parameter(0.5, unit="px", minimum=0.0, doc="standard deviation of the point spread")
+    water = Parameter(0.05, minimum=0.0, doc="reflectance of water")
+    land = Parameter(0.25, minimum=0.0, doc="reflectance of land")
+    light = Parameter(
+        [0.0, 0.0], shape=(2,), doc="growth of light from the left to the right, top to bottom"
+    )
+    noise = Parameter(0.002, minimum=0.0, doc="standard deviation of the noise [reflectance]")
+    clouds = Parameter(0.0, minimum=0.0, maximum=1.0, doc="share of the frame that they touch")
+    bits = Count(12, doc="of the codes of its pixels; 0: reflectance itself")
+
+    contour = MessageInput(**CONTOUR, doc="vertices of the lake's outline in the frame")
+    look = MessageInput(fields=LOOK, doc="which lake it is, and how well it is seen")
+    image = MessageOutput(**FRAME, doc="codes of the pixels")
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        height, width = FRAME["shape"]
+        images = np.zeros((self.n_members, height, width))
+        seen = self.contour.fresh & self.look.fresh & self.environment.active
+        draws = self.normals("noise", 1)[:, 0]
+        for m in np.flatnonzero(seen):
+            outline = self.contour.value[m, : self.contour.count[m]]
+            rng = np.random.default_rng(draws[m : m + 1].view(np.uint64))
+            look = Appearance(
+                water=float(self.water[m]),
+                land=float(self.land[m]),
+                gradient=(float(self.light[m, 0]), float(self.light[m, 1])),
+                noise=float(self.noise[m]),
+                bits=self.bits,
+            )
+            share = float(self.clouds[m])
+            opacity = cloud_opacity(width, height, share, rng) if share else None
+            covered = render_polygon(outline, width, height, blur=float(self.blur[m]))
+            images[m] = render_scene(covered, look, rng, opacity)
+        self.image.publish(self.look.t, images, valid=seen)

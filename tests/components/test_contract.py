@@ -29,7 +29,14 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("earlier_pass", "image_album", "image_former", "image_matcher"),
     *("recorded_echo", "recorded_reference", "reference_file", "scene_echo", "terrain"),
     "lake_catalog",  # and of maps of lakes: in truth/test_lakes
-    *("contour_moments", "lake_camera", "lake_correct", "lake_correct_considered"),
+    *(
+        "image_moments",
+        "lake_imager",
+        "contour_moments",
+        "lake_camera",
+        "lake_correct",
+        "lake_correct_considered",
+    ),
     *("last_known_orbit", "orbit_evaluation", "orbit_evaluation_considered"),
     *("orbit_predict", "orbit_predict_considered"),  # in systems/test_leo_lake
 }
