@@ -70,6 +70,12 @@ class LakeCatalog(Component):
     radius = SharedOutput(**RADII, doc="around the center, to the farthest vertex of the shore")
     area = SharedOutput(**AREAS, doc="on the ellipsoid")
 
+    def takes(self, name: str) -> bool:
+        """Whether a parameter has any effect: those of the file only where there is one."""
+        return super().takes(name) and (
+            name not in ("file", "name_field") or self.setting("source") == "file"
+        )
+
     def validate(self) -> None:
         """Read the lakes."""
         self._read()

@@ -129,7 +129,8 @@ def _component_problems(
     path: str, component: Component, duration: Fraction | None
 ) -> Iterator[TerrafixError]:
     missing = component.missing_settings()
-    refused = any(value is None for value in component.given_parameters.values())  # and reported
+    given, kept = component.given_parameters, component.parameter_values
+    refused = any(given[name] is None and name not in kept for name in given)  # and reported
     for name in missing:
         kind = component.settings()[name].kind()
         yield ConfigurationError(f"'{path}' needs a value for '{name}': it takes {kind}")
