@@ -53,7 +53,7 @@ class LakeCatalog(Component):
         unit="rad",
         minimum=-2 * np.pi,
         maximum=2 * np.pi,
-        doc="west, south, east, north around their centroids; a west beyond the east is across 180",
+        doc="west, south, east, north around their centroids; west beyond east: across 180",
     )
     area_min = Parameter(0.0, unit="m^2", minimum=0.0, doc="smallest area")
     area_max = Parameter(np.inf, unit="m^2", positive=True, infinite=True, doc="largest area")

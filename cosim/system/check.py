@@ -130,7 +130,8 @@ def _component_problems(
 ) -> Iterator[TerrafixError]:
     missing = component.missing_settings()
     given, kept = component.given_parameters, component.parameter_values
-    refused = any(given[name] is None and name not in kept for name in given)  # and reported
+    # and reported; None may be a value, too: of a file that is not named
+    refused = any(given[n] is None and (n not in kept or kept[n] is not None) for n in given)
     for name in missing:
         kind = component.settings()[name].kind()
         yield ConfigurationError(f"'{path}' needs a value for '{name}': it takes {kind}")
