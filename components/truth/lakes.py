@@ -53,7 +53,7 @@ class LakeCatalog(Component):
         unit="rad",
         minimum=-2 * np.pi,
         maximum=2 * np.pi,
-        doc="west, south, east, north around their centroids; a west beyond the east is across 180",
+        doc="west, south, east, north around their centroids; west beyond east: across 180",
     )
     area_min = Parameter(0.0, unit="m^2", minimum=0.0, doc="smallest area")
     area_max = Parameter(np.inf, unit="m^2", positive=True, infinite=True, doc="largest area")
@@ -69,6 +69,12 @@ class LakeCatalog(Component):
     center = SharedOutput(**CENTERS, doc="over the centroid, at the surface")
     radius = SharedOutput(**RADII, doc="around the center, to the farthest vertex of the shore")
     area = SharedOutput(**AREAS, doc="on the ellipsoid")
+
+    def takes(self, name: str) -> bool:
+        """Whether a parameter has any effect: those of the file only where there is one."""
+        return super().takes(name) and (
+            name not in ("file", "name_field") or self.setting("source") == "file"
+        )
 
     def validate(self) -> None:
         """Read the lakes."""

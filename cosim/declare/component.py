@@ -160,7 +160,7 @@ class Component(Shown):
     ports : dict of str to Port
     given_parameters : dict
         Parameters as they were set: before dispersions, without members. None stands for one that
-        was refused, and reported.
+        was refused, and reported; where None is a value, `parameter_values` then lacks it.
     parameter_values : dict
         Parameters as they are now: while a simulation runs, numeric ones have a row per member.
     state_arrays, port_views : dict

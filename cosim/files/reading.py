@@ -275,6 +275,8 @@ def _set(load: Load, component: Component, key: str, value: Any, *, from_file: b
     load.attempt(component.set_parameter, key, value, bare=not from_file)
     if len(load.problems) > before:
         component.given_parameters[key] = None
+        if settings[key].default is None:  # a file that need not be named
+            component.parameter_values.pop(key, None)
         return False
     setting = settings[key]
     if isinstance(setting, FileTable) and from_file:

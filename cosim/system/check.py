@@ -129,7 +129,9 @@ def _component_problems(
     path: str, component: Component, duration: Fraction | None
 ) -> Iterator[TerrafixError]:
     missing = component.missing_settings()
-    refused = any(value is None for value in component.given_parameters.values())  # and reported
+    given, kept = component.given_parameters, component.parameter_values
+    # and reported; None may be a value, too: of a file that is not named
+    refused = any(given[n] is None and (n not in kept or kept[n] is not None) for n in given)
     for name in missing:
         kind = component.settings()[name].kind()
         yield ConfigurationError(f"'{path}' needs a value for '{name}': it takes {kind}")

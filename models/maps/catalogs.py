@@ -626,5 +626,7 @@ def _read_gshhg(
         owner = _owner(island[0], [outlines[k] for k in near])
         if owner is not None:
             lakes[near[owner]].append(island[0])
+    if not lakes:
+        raise ValueError("gshhg has no lake in that box\n  widen it")
     for number, part in lakes.items():
         yield f"GSHHG {number}", part

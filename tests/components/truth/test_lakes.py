@@ -222,6 +222,28 @@ def test_a_file_that_may_not_be_read_is_one_configuration_error(file, monkeypatc
     assert told == f"'lakes' cannot read its lakes: '{file}': permission denied"
 
 
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ([], "'lakes' needs a catalog of lakes\n  set lakes.file, or"),
+        ([("lakes.file", "")], "'lakes.file' is ''; it takes the path of a file"),
+        ([("lakes.source", "gshhg"), ("lakes.file", "a.csv")], "cannot set 'lakes.file'\n  'lakes' "
+         "does not take 'file' with source = 'gshhg', islands = true: it would change nothing"),
+    ],
+)  # fmt: skip
+def test_settings_that_do_not_go_together_are_one_problem_of_the_check(tmp_path, settings, said):
+    """A file that is not named is looked for, too; one that was refused is not asked for again."""
+    (tmp_path / "system.toml").write_text(
+        'schema = "terrafix-system/1"\nduration = "1 s"\n'
+        '[component.lakes]\ntype = "lake_catalog"\nbox = "[-78, 42, -76, 43] deg"\n'
+    )
+    with pytest.raises(SystemCheckError) as raised:
+        read_system(tmp_path / "system.toml", settings)
+    told = [str(p) for p in raised.value.problems if "package" not in str(p)]  # is not installed
+    assert len(told) == 1
+    assert said in told[0]
+
+
 def test_a_bad_file_is_a_problem_of_the_check(tmp_path):
     (tmp_path / "lakes.csv").write_text("1,2\n3,4\n")
     (tmp_path / "system.toml").write_text(

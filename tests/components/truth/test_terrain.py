@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafix.components.truth.terrain import Terrain
-from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.system import System
 from terrafix.models.maps.dem import Dem, write_dem
@@ -32,3 +32,10 @@ def test_filled_voids_are_reported_once(tmp_path, caplog):
 def test_a_flat_earth_has_heights_of_the_earth(height):
     with pytest.raises(ConfigurationError, match=r"it must be at (most 9000|least -12000) m"):
         Terrain(source="flat", flat_height=height)
+
+
+def test_a_terrain_without_a_file_is_a_problem_of_the_check():
+    system = System("terrain")
+    system.add(Terrain(), "terrain")
+    with pytest.raises(SystemCheckError, match="'terrain' needs an elevation model\n  set terrain"):
+        system.check()

@@ -502,6 +502,8 @@ def test_the_format_of_gshhg(tmp_path, monkeypatch):
     (one,) = read_source("gshhg-high", Selection(box=deg(170, -40, -170, 0)))
     assert one.area == lakes[1].area
     np.testing.assert_allclose(np.degrees(one.outer[:, 1]).min(), -30, atol=1e-6)
+    with pytest.raises(ValueError, match="gshhg has no lake in that box"):
+        read_source("gshhg", Selection(box=deg(0, 0, 1, 1)))
     (tmp_path / "gshhs_f.dat").write_bytes(b"\0" * 80)
     with pytest.raises(ValueError, match=r"does not describe 'gshhs_f\.dat'"):
         read_source("gshhg")
