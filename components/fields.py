@@ -108,7 +108,7 @@ TIES: dict[str, Any] = {"shape": (None,)}
 PLACES: dict[str, Any] = {"shape": (None, None, 3), "unit": ("rad", "rad", "m")}
 """Latitude, longitude and height of a reference's tie points: their rows, their columns."""
 
-MOST_VERTICES = 1024
+MOST_VERTICES = 2048
 """Of an outline in an image."""
 
 CONTOUR: dict[str, Any] = {"shape": (MOST_VERTICES, 2), "unit": "px", "ragged": True}

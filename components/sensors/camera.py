@@ -92,7 +92,6 @@ class LakeCamera(Component):
         if self.catalog_sigma.any():
             draw = self.normals("catalog", self.vertices.size).reshape(n, -1, 3)
             self._moved = self.catalog_sigma[:, None, None] * draw
-        self._look(0.0)
 
     def _step_impl(self, t: float, dt: float) -> None:
         self._look(t)
@@ -105,6 +104,8 @@ class LakeCamera(Component):
         for lakes in self._candidates(t).T:  # nearest first; a whole outline before any other
             for number in np.unique(lakes[lakes >= 0]):
                 rows = np.flatnonzero((lakes == number) & (whole < 0.5))
+                if not rows.size:  # all that could see it have a whole one already
+                    continue
                 pixels, inside = self._outline(number, rows, t)
                 complete: NDArray[np.bool_] = np.asarray(inside.all(axis=1))
                 taken = complete | ((count[rows] == 0) & inside.any(axis=1))
