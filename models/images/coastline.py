@@ -5,14 +5,45 @@ the image than water and clouds together, gives the light: a plane :math:`l(x, y
 neither darker nor brighter (trimmed least squares). Water has a ratio q to it, the median of what
 lies inside dark regions, and coverage by water is
 
-.. math:: f = \frac{1 - I / l}{1 - q}.
+.. math:: f = \frac{1 - I / l}{1 - q};
+
+q is found again when a first contour tells which pixels hold nothing but water.
 
 The contour :math:`f = 1/2` by marching squares rounds off what is convex: it encloses too little,
 and the ends of a long lake count most in second moments. So it is moved along its normals until its
 own coverage, exact (`rendering`) and blurred by the point spread, is the image's: in each of some
 steps a vertex moves by what the image has more than the contour near it, per length.
 
-TABLE
+Measured on the outline of Lake Seneca at 176 x 33 px (1691 px^2, mxx 2083 px^2), noise of pixels
+relative to the contrast of water and land, mean and standard deviation over 24 places and angles
+without noise, over 60 places with:
+
+====  =====  ==============  =================  ================  ===============  ==============
+blur  noise  estimator       A [%]              x [px]            mxx [px^2]       myy [px^2]
+====  =====  ==============  =================  ================  ===============  ==============
+0     0      plain contour   -0.081, 0.060      -0.002, 0.016     -2.25, 1.89      -1.01, 1.42
+0     0      fitted contour  0.0005, 0.0004     -0.0001, 0.0001   0.002, 0.007     0.000, 0.004
+0     0      gray moments    0.0005, 0.0004     0.0000, 0.0001    0.002, 0.009     0.000, 0.007
+0.7   0      plain contour   -0.153, 0.020      0.003, 0.010      -6.19, 2.98      -2.05, 3.09
+0.7   0      fitted contour  0.0000, 0.0002     0.0000, 0.0001    -0.005, 0.008    -0.003, 0.005
+0.7   0      gray moments    0.0000, 0.0001     0.0000, 0.0000    -0.002, 0.001    -0.001, 0.001
+0     0.01   plain contour   -0.049, 0.057      0.003, 0.023      -3.25, 1.81      -0.079, 0.019
+0     0.01   fitted contour  0.000, 0.017       0.000, 0.010      -0.02, 0.43      -0.001, 0.014
+0     0.01   gray moments    0.000, 0.017       0.000, 0.010      -0.02, 0.43      -0.002, 0.015
+0.7   0.01   plain contour   -0.153, 0.025      0.000, 0.012      -7.92, 0.79      -0.214, 0.020
+0.7   0.01   fitted contour  -0.007, 0.031      0.000, 0.014      -0.05, 0.65      -0.005, 0.027
+0.7   0.01   gray moments    -0.007, 0.031      0.000, 0.014      -0.05, 0.66      -0.004, 0.028
+0.7   0.05   plain contour   -0.134, 0.109      0.007, 0.058      -7.86, 2.45      -0.207, 0.080
+0.7   0.05   fitted contour  -0.054, 0.146      0.007, 0.073      -0.76, 3.42      -0.008, 0.116
+0.7   0.05   gray moments    -0.053, 0.147      0.008, 0.072      -0.55, 3.31      -0.021, 0.118
+====  =====  ==============  =================  ================  ===============  ==============
+
+The plain contour is that of contourpy (which matplotlib brings) or of scikit-image's
+``find_contours``: their areas are the same to rounding. Outlines by OpenCV's ``findContours`` have
+an area 10 % too small, 1.3 % of an image enlarged 8 times; ``fillPoly`` is 10 % too large. Fitted
+contour and gray moments are as good; gray moments come with a covariance, the contour with a shape.
+A wrong `blur` matters to both.
+
 Excluded as no coast: what lies near clouds, that is near pixels brighter than land, and the frame.
 A thin cloud over water that is nowhere brighter than land is not told from land. Arms of water that
 are narrower than a pixel, which nowhere cover half of one, are lost, to gray moments too.
@@ -83,7 +114,7 @@ class Ring:
     coast : ndarray of bool, shape (K,)
         Which vertices are seen to lie on a coast: not on the frame, nor near a cloud.
     sigma : float
-        Standard deviation of a vertex across the coast, to some 20 percent [px]: by the noise of
+        Standard deviation of a vertex across the coast, within 25 percent, low [px]: by the noise of
         pixels, and 0.03 px by the rounding of small capes. Neighbors within some 3 px share it:
         moments of the ring have more noise than `moment_noise` says for independent vertices (see
         `gray_moments`).
