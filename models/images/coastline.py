@@ -114,7 +114,7 @@ class Ring:
     coast : ndarray of bool, shape (K,)
         Which vertices are seen to lie on a coast: not on the frame, nor near a cloud.
     sigma : float
-        Standard deviation of a vertex across the coast, within 25 percent, low [px]: by the noise of
+        Standard deviation of a vertex across the coast, within 25 percent, low [px]: by noise of
         pixels, and 0.03 px by the rounding of small capes. Neighbors within some 3 px share it:
         moments of the ring have more noise than `moment_noise` says for independent vertices (see
         `gray_moments`).
