@@ -207,6 +207,30 @@ def test_noise_of_gray_moments_is_that_of_monte_carlo():
     np.testing.assert_allclose(np.cov(drawn.T) / scale, P / scale, atol=4.5 * np.sqrt(2 / n) + 0.01)
 
 
+def test_the_bias_of_gray_moments_is_half_the_trace_of_the_hessian():
+    """By second differences of every pixel of a band, with steps of 0.1: to h^2 / A^2."""
+    f = render_polygon(small := bay() * 0.1 + np.array([0.3, -4.0]), 36, 18)
+    assert moments(small)[0][0] > 10
+    band = gaussian_filter(f, 0.7) > 1e-3
+    m, _, bias = gray_moments(f, 0.2, band)
+    trace, h = np.zeros(6), 0.1
+    for row, column in np.argwhere(band):
+        step = np.zeros(f.shape)
+        step[row, column] = h
+        trace += (gray_moments(f + step)[0] - 2 * m + gray_moments(f - step)[0]) / h**2
+    np.testing.assert_allclose(bias, 0.2**2 / 2 * trace, rtol=2e-3, atol=1e-9)
+    assert np.abs(bias[3:]).max() > 1e-3
+
+
+def test_the_shared_factor_is_that_of_the_mean_of_clear_water():
+    """Noise over the square root of the number of pixels that hold water alone."""
+    ring = bay((0.2, 0.3))
+    f = render_polygon(ring, WIDTH, HEIGHT, blur=0.7)
+    c = coastline(seen(f, 0.02, RNG(3)), blur=0.7)
+    # at 0.99 the contour's own noise moves some pixels over the border
+    assert c.gain == pytest.approx(0.02 / np.sqrt((f > 0.99).sum()), rel=0.05)
+
+
 # ------------------------------------------------------------------------------------- shapes
 
 
