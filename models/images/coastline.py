@@ -195,7 +195,7 @@ def coastline(
     ------
     ValueError
         If the image is not a plane of finite numbers, `blur`, `margin` or `smallest` is negative,
-        or nothing in it is water.
+        or no water is seen in it.
     """
     for name, value in (("blur", blur), ("margin", margin), ("smallest", smallest)):
         if not (np.isfinite(value) and value >= 0):
@@ -215,8 +215,13 @@ def coastline(
     rings = _fitted(found, coasts, f, near, blur)
     # the brightness of water again, now that it is known how much land is in it
     inner = ring_coverage(rings, width, height, blur)[~hidden]
-    weight = np.where(inner >= min(_INNER, np.partition(inner, -_DEEP)[-_DEEP]), inner, 0.0)
+    least = np.sort(inner)[-_DEEP:].min(initial=_INNER)
+    weight = np.where(inner >= least, inner, 0.0)
     total = float(weight @ weight)
+    if total < 1:
+        raise ValueError(
+            f"an image shows water, clouds and their {margin:g} px of margin hide all of this one's"
+        )
     scale = float(weight @ f[~hidden]) / total
     f, noise, gain = f / scale, noise / scale, noise / scale / total**0.5
     rings = _fitted(rings, coasts, f, near, blur)
@@ -245,7 +250,8 @@ def gray_moments(
     .. math:: A = \sum f, \quad \bar x = \sum f x / A, \quad
               \mu_{xx} = \sum f (x - \bar x)^2 / A - \tfrac 1{12} - b^2
 
-    A pixel's square adds 1/12 px^2 to second moments, a point spread its variance b^2. With
+    A pixel's square adds 1/12 px^2 to second moments, in the mean over places within a pixel (sides
+    along whole rows of pixels add -1/12 to 1/6), and a point spread its variance b^2. With
     independent noise of pixels, :math:`\partial m / \partial f` is
 
     .. math:: 1, \quad (x - \bar x) / A, \quad ((x - \bar x)^2 - \mu'_{xx}) / A, \quad

@@ -307,6 +307,17 @@ def test_clouds_off_the_lake_do_no_harm():
     assert c.hidden.mean() > 0.05
 
 
+def test_water_that_clouds_hide_is_refused():
+    """Cloud over all but a strip of the lake that is within the margin of them."""
+    f = render_polygon(bay(), WIDTH, HEIGHT)
+    alpha = np.zeros(f.shape)
+    alpha[90:170, 60:157] = alpha[90:170, 164:260] = 1
+    image = render_scene(f, Appearance(bits=0), RNG(0), alpha)
+    with pytest.raises(ValueError, match=r"shows water, clouds and their 4 px of margin hide all"):
+        coastline(image)
+    assert not coastline(image, margin=1.0).rings[0].whole
+
+
 # ------------------------------------------------------------------------------------- bad input
 
 
