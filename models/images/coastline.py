@@ -44,9 +44,11 @@ an area 10 % too small, 1.3 % of an image enlarged 8 times; ``fillPoly`` is 10 %
 contour and gray moments are as good; gray moments come with a covariance, the contour with a shape.
 A wrong `blur` matters to both.
 
-Excluded as no coast: what lies near clouds, that is near pixels brighter than land, and the frame.
-A thin cloud over water that is nowhere brighter than land is not told from land. Arms of water that
-are narrower than a pixel, which nowhere cover half of one, are lost, to gray moments too.
+Excluded as no coast: what lies near clouds, that is near pixels brighter than land or near gray that
+is wider than a blurred coast, and the frame. Thin cloud can still pass for land: of 120 images with
+clouds of all sizes over up to 45 %, 12 had coast that was more than a pixel off, up to 9 % of its
+vertices. Arms of water that are narrower than a pixel, which nowhere cover half of one, are lost, to
+gray moments too.
 
 Coordinates are those of `polygons`: (x, y), whole at the centers of pixels.
 
@@ -64,7 +66,7 @@ import numpy as np
 import shapely
 from contourpy import FillType, contour_generator
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_dilation, binary_erosion, label
+from scipy.ndimage import binary_dilation, binary_erosion, binary_opening, label
 from scipy.special import ndtr
 
 from terrafix.models.core.arrays import FloatArray
@@ -89,6 +91,8 @@ _DARK = 6.0
 """How far water must be below land, in its standard deviations."""
 _BRIGHT, _BRIGHTER = 5.0, 0.15
 """How far clouds are above land: in its standard deviations, and in the contrast of water."""
+_GRAY = 0.1
+"""How far from land and from water coverage is neither."""
 _SPECK = 3
 """Pixels that a cloud must have."""
 _STEPS = 4
@@ -201,7 +205,11 @@ def coastline(
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{name} is finite and 0 or more, got {value}")
     f, noise, cloud = _coverage(_image(image), blur)
-    hidden = _dilated(cloud, margin)
+    gray = (f > _GRAY) & (f < 1 - _GRAY)  # wider than a coast, it is a cloud's soft edge over water
+    n = int(np.ceil(_reach(blur)))
+    y, x = np.mgrid[-n : n + 1, -n : n + 1]
+    thin = binary_opening(gray, x * x + y * y <= n * n)
+    hidden = _dilated(cloud | thin, margin)
     found = [ring for ring in _contours(f) if abs(_area(ring)) >= max(smallest, 1e-9)]
     water = [ring for ring in found if _area(ring) > 0]
     if not water:

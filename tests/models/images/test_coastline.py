@@ -294,6 +294,22 @@ def test_edges_of_clouds_are_no_coast():
     assert cut >= 3, "clouds must lie on the lake to be tested"
 
 
+def test_a_soft_edge_of_a_cloud_across_the_lake_is_no_coast():
+    """It darkens from cloud to water over 40 px: nowhere is there a border, but gray."""
+    t = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+    ring = np.stack([150 + 60 * np.cos(t), 120 + 50 * np.sin(t)], axis=1)
+    f = render_polygon(ring, WIDTH, HEIGHT, blur=0.7)
+    alpha = np.broadcast_to(np.clip((np.arange(WIDTH) - 150) / 40, 0, 1), f.shape)
+    image = render_scene(
+        f, Appearance(noise=0.002), RNG(0), alpha * (np.arange(HEIGHT) < 200)[:, None]
+    )
+    c = coastline(image, blur=0.7)
+    assert not any(part.whole for part in c.rings)
+    off = [distances(part.vertices[part.coast], ring).distance for part in c.rings]
+    assert sum(map(len, off)) > 100
+    assert np.concatenate(off).max() < 0.75
+
+
 def test_clouds_off_the_lake_do_no_harm():
     ring = bay()
     m, _ = moments(ring)
