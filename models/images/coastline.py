@@ -44,10 +44,10 @@ an area 10 % too small, 1.3 % of an image enlarged 8 times; ``fillPoly`` is 10 %
 contour and gray moments are as good; gray moments come with a covariance, the contour with a shape.
 A wrong `blur` matters to both.
 
-Excluded as no coast: what lies near clouds, that is near pixels brighter than land or near gray that
-is wider than a blurred coast, and the frame. Thin cloud can still pass for land: of 120 images with
-clouds of all sizes over up to 45 %, 12 had coast that was more than a pixel off, up to 9 % of its
-vertices. Arms of water that are narrower than a pixel, which nowhere cover half of one, are lost, to
+Excluded as no coast: what lies near clouds, that is near pixels brighter than land or near gray
+that is wider than a blurred coast, and the frame. Thin cloud can still pass for land: of 120 images
+with clouds of many sizes over up to 45 %, 14 had coast that was more than a pixel off, up to 9 %
+of its vertices. Arms of water narrower than a pixel, which nowhere cover half of one, are lost, to
 gray moments too.
 
 Coordinates are those of `polygons`: (x, y), whole at the centers of pixels.
