@@ -1,1 +1,1 @@
-"""References of the ground, and how one image is found on another."""
+"""References of the ground, how one image is found on another, and water: drawn, and measured."""

@@ -5,17 +5,50 @@ the image than water and clouds together, gives the light: a plane :math:`l(x, y
 neither darker nor brighter (trimmed least squares). Water has a ratio q to it, the median of what
 lies inside dark regions, and coverage by water is
 
-.. math:: f = \frac{1 - I / l}{1 - q}.
+.. math:: f = \frac{1 - I / l}{1 - q};
+
+q is found again when a first contour tells which pixels hold nothing but water.
 
 The contour :math:`f = 1/2` by marching squares rounds off what is convex: it encloses too little,
 and the ends of a long lake count most in second moments. So it is moved along its normals until its
 own coverage, exact (`rendering`) and blurred by the point spread, is the image's: in each of some
 steps a vertex moves by what the image has more than the contour near it, per length.
 
-TABLE
-Excluded as no coast: what lies near clouds, that is near pixels brighter than land, and the frame.
-A thin cloud over water that is nowhere brighter than land is not told from land. Arms of water that
-are narrower than a pixel, which nowhere cover half of one, are lost, to gray moments too.
+Measured on the outline of Lake Seneca at 176 x 33 px (1691 px^2, mxx 2083 px^2), noise of pixels
+relative to the contrast of water and land, mean and standard deviation over 24 places and angles
+without noise, over 60 places with:
+
+====  =====  ==============  =================  ================  ===============  ==============
+blur  noise  estimator       A [%]              x [px]            mxx [px^2]       myy [px^2]
+====  =====  ==============  =================  ================  ===============  ==============
+0     0      plain contour   -0.081, 0.060      -0.002, 0.016     -2.25, 1.89      -1.01, 1.42
+0     0      fitted contour  0.0005, 0.0004     -0.0001, 0.0001   0.002, 0.007     0.000, 0.004
+0     0      gray moments    0.0005, 0.0004     0.0000, 0.0001    0.002, 0.009     0.000, 0.007
+0.7   0      plain contour   -0.153, 0.020      0.003, 0.010      -6.19, 2.98      -2.05, 3.09
+0.7   0      fitted contour  0.0000, 0.0002     0.0000, 0.0001    -0.005, 0.008    -0.003, 0.005
+0.7   0      gray moments    0.0000, 0.0001     0.0000, 0.0000    -0.002, 0.001    -0.001, 0.001
+0     0.01   plain contour   -0.049, 0.057      0.003, 0.023      -3.25, 1.81      -0.079, 0.019
+0     0.01   fitted contour  0.000, 0.017       0.000, 0.010      -0.02, 0.43      -0.001, 0.014
+0     0.01   gray moments    0.000, 0.017       0.000, 0.010      -0.02, 0.43      -0.002, 0.015
+0.7   0.01   plain contour   -0.153, 0.025      0.000, 0.012      -7.92, 0.79      -0.214, 0.020
+0.7   0.01   fitted contour  -0.007, 0.031      0.000, 0.014      -0.05, 0.65      -0.005, 0.027
+0.7   0.01   gray moments    -0.007, 0.031      0.000, 0.014      -0.05, 0.66      -0.004, 0.028
+0.7   0.05   plain contour   -0.134, 0.109      0.007, 0.058      -7.86, 2.45      -0.207, 0.080
+0.7   0.05   fitted contour  -0.054, 0.146      0.007, 0.073      -0.76, 3.42      -0.008, 0.116
+0.7   0.05   gray moments    -0.053, 0.147      0.008, 0.072      -0.55, 3.31      -0.021, 0.118
+====  =====  ==============  =================  ================  ===============  ==============
+
+The plain contour is that of contourpy (which matplotlib brings) or of scikit-image's
+``find_contours``: their areas are the same to rounding. Outlines by OpenCV's ``findContours`` have
+an area 10 % too small, 1.3 % of an image enlarged 8 times; ``fillPoly`` is 10 % too large. Fitted
+contour and gray moments are as good; gray moments come with a covariance, the contour with a shape.
+A wrong `blur` matters to both.
+
+Excluded as no coast: what lies near clouds, that is near pixels brighter than land or near gray
+that is wider than a blurred coast, and the frame. Thin cloud can still pass for land: of 120 images
+with clouds of many sizes over up to 45 %, 14 had coast that was more than a pixel off, up to 9 %
+of its vertices. Arms of water narrower than a pixel, which nowhere cover half of one, are lost, to
+gray moments too.
 
 Coordinates are those of `polygons`: (x, y), whole at the centers of pixels.
 
@@ -33,7 +66,7 @@ import numpy as np
 import shapely
 from contourpy import FillType, contour_generator
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_dilation, binary_erosion, label
+from scipy.ndimage import binary_dilation, binary_erosion, binary_opening, label
 from scipy.special import ndtr
 
 from terrafix.models.core.arrays import FloatArray
@@ -58,6 +91,8 @@ _DARK = 6.0
 """How far water must be below land, in its standard deviations."""
 _BRIGHT, _BRIGHTER = 5.0, 0.15
 """How far clouds are above land: in its standard deviations, and in the contrast of water."""
+_GRAY = 0.1
+"""How far from land and from water coverage is neither."""
 _SPECK = 3
 """Pixels that a cloud must have."""
 _STEPS = 4
@@ -83,7 +118,7 @@ class Ring:
     coast : ndarray of bool, shape (K,)
         Which vertices are seen to lie on a coast: not on the frame, nor near a cloud.
     sigma : float
-        Standard deviation of a vertex across the coast, to some 20 percent [px]: by the noise of
+        Standard deviation of a vertex across the coast, within 25 percent, low [px]: by noise of
         pixels, and 0.03 px by the rounding of small capes. Neighbors within some 3 px share it:
         moments of the ring have more noise than `moment_noise` says for independent vertices (see
         `gray_moments`).
@@ -164,13 +199,17 @@ def coastline(
     ------
     ValueError
         If the image is not a plane of finite numbers, `blur`, `margin` or `smallest` is negative,
-        or nothing in it is water.
+        or no water is seen in it.
     """
     for name, value in (("blur", blur), ("margin", margin), ("smallest", smallest)):
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{name} is finite and 0 or more, got {value}")
     f, noise, cloud = _coverage(_image(image), blur)
-    hidden = _dilated(cloud, margin)
+    gray = (f > _GRAY) & (f < 1 - _GRAY)  # wider than a coast, it is a cloud's soft edge over water
+    n = int(np.ceil(_reach(blur)))
+    y, x = np.mgrid[-n : n + 1, -n : n + 1]
+    thin = binary_opening(gray, x * x + y * y <= n * n)
+    hidden = _dilated(cloud | thin, margin)
     found = [ring for ring in _contours(f) if abs(_area(ring)) >= max(smallest, 1e-9)]
     water = [ring for ring in found if _area(ring) > 0]
     if not water:
@@ -184,8 +223,13 @@ def coastline(
     rings = _fitted(found, coasts, f, near, blur)
     # the brightness of water again, now that it is known how much land is in it
     inner = ring_coverage(rings, width, height, blur)[~hidden]
-    weight = np.where(inner >= min(_INNER, np.partition(inner, -_DEEP)[-_DEEP]), inner, 0.0)
+    least = np.sort(inner)[-_DEEP:].min(initial=_INNER)
+    weight = np.where(inner >= least, inner, 0.0)
     total = float(weight @ weight)
+    if total < 1:
+        raise ValueError(
+            f"an image shows water, clouds and their {margin:g} px of margin hide all of this one's"
+        )
     scale = float(weight @ f[~hidden]) / total
     f, noise, gain = f / scale, noise / scale, noise / scale / total**0.5
     rings = _fitted(rings, coasts, f, near, blur)
@@ -214,7 +258,8 @@ def gray_moments(
     .. math:: A = \sum f, \quad \bar x = \sum f x / A, \quad
               \mu_{xx} = \sum f (x - \bar x)^2 / A - \tfrac 1{12} - b^2
 
-    A pixel's square adds 1/12 px^2 to second moments, a point spread its variance b^2. With
+    A pixel's square adds 1/12 px^2 to second moments, in the mean over places within a pixel (sides
+    along whole rows of pixels add -1/12 to 1/6), and a point spread its variance b^2. With
     independent noise of pixels, :math:`\partial m / \partial f` is
 
     .. math:: 1, \quad (x - \bar x) / A, \quad ((x - \bar x)^2 - \mu'_{xx}) / A, \quad

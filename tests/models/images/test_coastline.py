@@ -207,6 +207,30 @@ def test_noise_of_gray_moments_is_that_of_monte_carlo():
     np.testing.assert_allclose(np.cov(drawn.T) / scale, P / scale, atol=4.5 * np.sqrt(2 / n) + 0.01)
 
 
+def test_the_bias_of_gray_moments_is_half_the_trace_of_the_hessian():
+    """By second differences of every pixel of a band, with steps of 0.1: to h^2 / A^2."""
+    f = render_polygon(small := bay() * 0.1 + np.array([0.3, -4.0]), 36, 18)
+    assert moments(small)[0][0] > 10
+    band = gaussian_filter(f, 0.7) > 1e-3
+    m, _, bias = gray_moments(f, 0.2, band)
+    trace, h = np.zeros(6), 0.1
+    for row, column in np.argwhere(band):
+        step = np.zeros(f.shape)
+        step[row, column] = h
+        trace += (gray_moments(f + step)[0] - 2 * m + gray_moments(f - step)[0]) / h**2
+    np.testing.assert_allclose(bias, 0.2**2 / 2 * trace, rtol=2e-3, atol=1e-9)
+    assert np.abs(bias[3:]).max() > 1e-3
+
+
+def test_the_shared_factor_is_that_of_the_mean_of_clear_water():
+    """Noise over the square root of the number of pixels that hold water alone."""
+    ring = bay((0.2, 0.3))
+    f = render_polygon(ring, WIDTH, HEIGHT, blur=0.7)
+    c = coastline(seen(f, 0.02, RNG(3)), blur=0.7)
+    # at 0.99 the contour's own noise moves some pixels over the border
+    assert c.gain == pytest.approx(0.02 / np.sqrt((f > 0.99).sum()), rel=0.05)
+
+
 # ------------------------------------------------------------------------------------- shapes
 
 
@@ -270,6 +294,22 @@ def test_edges_of_clouds_are_no_coast():
     assert cut >= 3, "clouds must lie on the lake to be tested"
 
 
+def test_a_soft_edge_of_a_cloud_across_the_lake_is_no_coast():
+    """It darkens from cloud to water over 40 px: nowhere is there a border, but gray."""
+    t = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+    ring = np.stack([150 + 60 * np.cos(t), 120 + 50 * np.sin(t)], axis=1)
+    f = render_polygon(ring, WIDTH, HEIGHT, blur=0.7)
+    alpha = np.broadcast_to(np.clip((np.arange(WIDTH) - 150) / 40, 0, 1), f.shape)
+    image = render_scene(
+        f, Appearance(noise=0.002), RNG(0), alpha * (np.arange(HEIGHT) < 200)[:, None]
+    )
+    c = coastline(image, blur=0.7)
+    assert not any(part.whole for part in c.rings)
+    off = [distances(part.vertices[part.coast], ring).distance for part in c.rings]
+    assert sum(map(len, off)) > 100
+    assert np.concatenate(off).max() < 0.75
+
+
 def test_clouds_off_the_lake_do_no_harm():
     ring = bay()
     m, _ = moments(ring)
@@ -281,6 +321,17 @@ def test_clouds_off_the_lake_do_no_harm():
     assert abs(got[0] / m[0] - 1) < 5e-4
     assert abs(gray[0] / m[0] - 1) < 5e-4
     assert c.hidden.mean() > 0.05
+
+
+def test_water_that_clouds_hide_is_refused():
+    """Cloud over all but a strip of the lake that is within the margin of them."""
+    f = render_polygon(bay(), WIDTH, HEIGHT)
+    alpha = np.zeros(f.shape)
+    alpha[90:170, 60:157] = alpha[90:170, 164:260] = 1
+    image = render_scene(f, Appearance(bits=0), RNG(0), alpha)
+    with pytest.raises(ValueError, match=r"shows water, clouds and their 4 px of margin hide all"):
+        coastline(image)
+    assert not coastline(image, margin=1.0).rings[0].whole
 
 
 # ------------------------------------------------------------------------------------- bad input
