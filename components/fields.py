@@ -124,6 +124,17 @@ LOOK = {
 }
 """What lake an outline is of, and how well it is known."""
 
+LAKE_MOMENTS = ("area", "center_u", "center_v", "moment_uu", "moment_vv", "moment_uv")
+LAKE_UNITS = ("px^2", "px", "px", "px^2", "px^2", "px^2")
+
+LAKE_FIX = {
+    "y": Field((6,), LAKE_UNITS, labels=LAKE_MOMENTS, doc="measured moments of an outline"),
+    "lake": Field((1,), "1", doc="number of the lake in its catalog"),
+    "R": Field((6, 6), "1", doc="covariance of the noise of y, in its units"),
+    "present": Field((6,), "1", labels=LAKE_MOMENTS, doc="1 where an element was measured, else 0"),
+}
+"""A fix from one look at a lake."""
+
 CORNERS: dict[str, Any] = {"shape": (None, 3), "unit": "m", "frame": "e"}
 """Vertices of the rings of all lakes, one ring after the other, not closed."""
 

@@ -47,9 +47,9 @@ class LakeCorrect(EnsembleCorrect):
     rotation_rate = Parameter(
         EARTH.rotation_rate, unit="rad/s", doc="Earth rotation, as the filter knows it"
     )
-    vertices = SharedInput(**CORNERS)
-    starts = SharedInput(**STARTS)
-    center = SharedInput(**CENTERS)
+    vertices = SharedInput(**CORNERS, doc="of the rings of all lakes")
+    starts = SharedInput(**STARTS, doc="of rings in the vertices")
+    center = SharedInput(**CENTERS, doc="of each lake")
 
 
 class ConsideredLakeCorrect(LakeCorrect):

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.components.fields import CONTOUR, FRAME, LOOK
-from terrafix.components.filters.family import fix_fields
+from terrafix.components.fields import CONTOUR, FRAME, LAKE_FIX, LAKE_MOMENTS, LOOK
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import MessageInput, MessageOutput, Output
-from terrafix.models.filters.lake import MOMENTS, ORBIT, lake_observation
 from terrafix.models.images.coastline import coastline, gray_moments
 from terrafix.models.images.polygons import moment_noise, moments
 
@@ -42,14 +40,14 @@ class ContourMoments(Component):
 
     contour = MessageInput(**CONTOUR, doc="outline in the frame")
     look = MessageInput(fields=LOOK, doc="which lake it is of, and how well it is seen")
-    fix = MessageOutput(fields=fix_fields(lake_observation(ORBIT)), doc="its moments")
+    fix = MessageOutput(fields=LAKE_FIX, doc="its moments")
 
     def takes(self, name: str) -> bool:
         """Whether a setting has any effect."""
         return name != "variance" or self.noise == "given"
 
     def _step_impl(self, t: float, dt: float) -> None:
-        contour, look, n, m = self.contour, self.look, self.n_members, len(MOMENTS)
+        contour, look, n, m = self.contour, self.look, self.n_members, len(LAKE_MOMENTS)
         y, R = np.zeros((n, m)), np.tile(np.eye(m), (n, 1, 1))
         good = contour.fresh & look.fresh & (look.whole > 0.5)
         for count in np.unique(contour.count[good]):
@@ -78,14 +76,14 @@ class ImageMoments(Component):
 
     image = MessageInput(**FRAME, doc="codes of the pixels")
     look = MessageInput(fields=LOOK, doc="which lake it is")
-    fix = MessageOutput(fields=fix_fields(lake_observation(ORBIT)), doc="its moments")
+    fix = MessageOutput(fields=LAKE_FIX, doc="its moments")
     clear = Output(doc="1 where the shore was seen whole, 0 where not, NaN without an image")
 
     def _initialize_impl(self) -> None:
         self.clear = np.nan
 
     def _step_impl(self, t: float, dt: float) -> None:
-        n, m = self.n_members, len(MOMENTS)
+        n, m = self.n_members, len(LAKE_MOMENTS)
         y, R = np.zeros((n, m)), np.tile(np.eye(m), (n, 1, 1))
         told = self.image.fresh & self.look.fresh & (self.look.whole > 0.5)
         good = np.zeros(n, dtype=np.bool_)

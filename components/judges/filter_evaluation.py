@@ -70,9 +70,9 @@ class FilterEvaluation(Evaluation):
                     truth.fixed_shape, unit=truth.unit, frame=truth.frame, doc="truth"
                 )
                 labels = block.axes if block.size > 1 else ()
-                for kind in ("error", "sigma"):
+                for kind, doc in (("error", "estimate minus truth"), ("sigma", "predicted")):
                     ports[f"{name}_{kind}"] = Output(
-                        (block.size,), unit=block.unit, frame=block.frame, labels=labels
+                        (block.size,), unit=block.unit, frame=block.frame, labels=labels, doc=doc
                     )
             fields = estimate_fields(cls.error_state)
             ports["estimate"] = BundleInput(fields, doc="to be evaluated")

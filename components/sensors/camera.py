@@ -70,10 +70,10 @@ class LakeCamera(Component):
 
     r_i = Input((3,), unit="m", frame="i", doc="true position")
     v_i = Input((3,), unit="m/s", frame="i", doc="true velocity")
-    vertices = SharedInput(**CORNERS)
-    starts = SharedInput(**STARTS)
-    center = SharedInput(**CENTERS)
-    radius = SharedInput(**RADII)
+    vertices = SharedInput(**CORNERS, doc="of the rings of all lakes")
+    starts = SharedInput(**STARTS, doc="of rings in the vertices")
+    center = SharedInput(**CENTERS, doc="of each lake")
+    radius = SharedInput(**RADII, doc="around each center")
 
     contour = MessageOutput(**CONTOUR, doc="vertices of the lake's outline in the frame")
     look = MessageOutput(fields=LOOK, doc="which lake it is, and how well it is seen")

@@ -420,12 +420,13 @@ def test_a_fix_may_measure_the_effective_velocity(case, update):
 
 def test_what_passes_between_the_parts_follows_from_the_filter():
     """The declared fields of estimate, fix and innovation are those of its error state."""
-    from terrafix.components.fields import ESTIMATE, FIX, INNOVATION
+    from terrafix.components.fields import ESTIMATE, FIX, INNOVATION, LAKE_FIX
     from terrafix.components.filters.family import (
         estimate_fields,
         fix_fields,
         innovation_fields,
     )
+    from terrafix.models.filters.lake import ORBIT, lake_observation
     from terrafix.models.filters.spacecraft import STATE, sar_observation
 
     seen = sar_observation()
@@ -433,6 +434,7 @@ def test_what_passes_between_the_parts_follows_from_the_filter():
         (ESTIMATE, estimate_fields(STATE)),
         (FIX, fix_fields(seen)),
         (INNOVATION, innovation_fields(seen)),
+        (LAKE_FIX, fix_fields(lake_observation(ORBIT))),
     ):
         assert list(declared) == list(derived)
         for name, field in declared.items():
