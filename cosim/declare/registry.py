@@ -12,6 +12,7 @@ be imported.
 from __future__ import annotations
 
 import sys
+from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -24,6 +25,20 @@ GROUP = "terrafix.components"
 
 def component_entries() -> dict[str, EntryPoint]:
     """Entry points of all installed component types, by name, without importing them."""
+    return dict(_entries(tuple((path, _changed(path)) for path in sys.path)))
+
+
+def _changed(path: str) -> int:
+    """When a folder of modules was changed last; 0 if it is none."""
+    try:
+        return Path(path).stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+@lru_cache(maxsize=4)
+def _entries(_paths: tuple[tuple[str, int], ...]) -> dict[str, EntryPoint]:
+    """Those of the folders as they are: what is installed meanwhile is found."""
     return {e.name: e for e in entry_points(group=GROUP)}
 
 
