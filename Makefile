@@ -52,6 +52,8 @@ benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/verdicts.py
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
 	    then $(BIN)/python benchmarks/real_echo.py; fi
+	@if test -d "$${TERRAFIX_DATA:-../shared/data}/lakes_gshhg"; \
+	    then $(BIN)/python benchmarks/lake.py; fi
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -173,13 +173,15 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
             yield rows, Seen(own, told, given["vertices"][begin:end], given["center"][lake])
 
     # both are asked of the same estimates: what they see is kept from one to the other
-    kept: list[Any] = [None, None]
+    kept: list[tuple[Arrays, list[Any]]] = []
 
     def both(values: Arrays, given: Arrays) -> list[Any]:
-        if kept[0] is not values:
-            looks = [(*look, *moments(look[1].pixels)) for look in each_lake(values, given)]
-            kept[:] = [values, looks]
-        return kept[1]  # type: ignore[no-any-return]
+        last = kept[:]  # another thread may put its own there meanwhile
+        if last and last[0][0] is values:
+            return last[0][1]
+        looks = [(*look, *moments(look[1].pixels)) for look in each_lake(values, given)]
+        kept[:] = [(values, looks)]
+        return looks
 
     def predict(values: Arrays, given: Arrays) -> FloatArray:
         found = np.empty((len(values["r"]), len(MOMENTS)))

@@ -1,0 +1,110 @@
+"""How well a satellite knows itself by a lake: errors, consistency, time, and what a contour tells.
+
+    python benchmarks/lake.py [--members 200] [--few 50]
+
+Errors of the position after seven seconds, by case and by what is changed, beside the filter's own
+sigma and NEES; and the bound of Cramer and Rao: what all vertices would tell of position and
+velocity if each were known by its number, over the same frames and from the same prior. Needs the
+outline of Seneca Lake (TERRAFIX_DATA).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import terrafix as tf
+from terrafix.models.filters.lake import CAMERA, Seen
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+TEN_HZ = tuple(
+    (f"{name}.period", "0.1 s")
+    for name in ("orbit", "camera", "moments", "predict", "correct", "evaluation")
+)
+CASES = {"T1": (15e3, 1.0), "T2": (15e3, 100.0), "T3": (70e3, 100.0)}
+VARIANTS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
+    "10 Hz": ("T3", TEN_HZ),
+    "0.5 px": ("T2", (("camera.vertex_sigma", "0.5 px"),)),
+    "0.5 px, biased": (
+        "T2",
+        (("camera.vertex_sigma", "0.5 px"), ("moments.unbiased", "false")),
+    ),
+    "three moments": ("T3", (("moments.elements", "three"),)),
+    "not iterated": ("T3", (("correct.update", "ekf"),)),
+    "Earth stands still": ("T3", (("correct.rotation_rate", "0 rad/s"),)),
+    "attitude 0.02 deg": ("T3", (("camera.attitude_sigma", "0.02 deg"),)),
+    "catalog 100 m": ("T3", (("camera.catalog_sigma", "100 m"),)),
+}
+
+
+def fly(
+    file: str, case: str, members: int, settings: Any = (), names: Any = ("evaluation",)
+) -> None:
+    """Fly a system, and print a line for each of its filters."""
+    system = tf.read_system(EXAMPLES / file, [("case", case), *settings])
+    began = time.process_time()
+    data = tf.simulate(system, members=members).dataset
+    took = (time.process_time() - began) / members
+    for name in names:
+        error = np.linalg.norm(data[f"{name}.position_error"].values[-1], axis=1) / 1e3
+        sigma = np.linalg.norm(data[f"{name}.position_sigma"].values[-1], axis=1).mean() / 1e3
+        nees = np.nanmean(data[f"{name}.nees"].values[-1])
+        print(
+            f"  median {np.nanmedian(error):8.3f}  90 % {np.nanpercentile(error, 90):8.3f} km"
+            f"  sigma {sigma:6.3f}  NEES {nees:9.3g}  {took:6.3f} s CPU/member  {name}"
+        )
+
+
+def bound(case: str, sigma: float = 0.25) -> float:
+    """Root of the trace of the smallest covariance of the position at the end [km]."""
+    system = tf.read_system(EXAMPLES / "leo_lake.toml", [("case", case)])
+    orbit, camera = system.find("orbit"), system.find("camera")
+    system.record("truth", [orbit["r_i"], orbit["v_i"]], period="1/30")
+    data = tf.simulate(system, members=1)
+    r, v = (data.dataset[f"orbit.{n}"].values[:, 0] for n in ("r_i", "v_i"))
+    lakes = tf.Simulation(system, members=1)
+    lakes.initialize()
+    points = np.asarray(system.find("lakes").vertices)
+    given = {n: np.reshape(camera.setting(n), (1, -1)) for n in CAMERA}
+    at, step = CASES[case], 1 / 30
+    information = np.diag(np.repeat([at[0] ** -2.0, at[1] ** -2.0], 3))
+    for k in range(1, len(r)):
+        n = np.linalg.norm(r[k])
+        pull = -3.986004418e14 / n**3 * (np.eye(3) - 3 * np.outer(r[k], r[k]) / n**2)
+        A = np.block([[np.zeros((3, 3)), np.eye(3)], [pull, np.zeros((3, 3))]])
+        back = np.linalg.inv(np.eye(6) + step * A + step**2 / 2 * A @ A)
+        information = back.T @ information @ back
+        told = given | {"t": np.array([[k * step]])}
+        seen = Seen({"r": r[k : k + 1], "v": v[k : k + 1]}, told, points, points.mean(axis=0))
+        every = np.eye(2 * len(points)).reshape(1, 2 * len(points), len(points), 2)
+        H = seen.derivative(every)[0, :, :6] / sigma
+        information = information + H.T @ H
+    return float(np.sqrt(np.trace(np.linalg.inv(information)[:3, :3]))) / 1e3
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--members", type=int, default=200)
+    parser.add_argument("--few", type=int, default=50)
+    options = parser.parse_args()
+    for case in CASES:
+        print(f"leo_lake, {case}: all vertices could tell {bound(case):.4f} km")
+        fly("leo_lake.toml", case, options.members)
+    for name, (case, settings) in VARIANTS.items():
+        print(f"leo_lake, {case}, {name}")
+        fly("leo_lake.toml", case, options.few, settings)
+    for case in CASES:
+        print(f"leo_lake_printed, {case}")
+        names = ("ekf_evaluation", "ukf_evaluation")
+        fly("leo_lake_printed.toml", case, options.few, names=names)
+    print("leo_lake_image, T3")
+    fly("leo_lake_image.toml", "T3", 10)
+
+
+if __name__ == "__main__":
+    main()
