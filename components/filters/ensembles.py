@@ -85,6 +85,10 @@ class EnsembleCorrect(FilterCorrect):
         found = self._answers.get(name)
         return super()._input_array(name) if found is None else found
 
+    def _initialize_impl(self) -> None:
+        self._ask()  # a fix may be there at the start
+        super()._initialize_impl()
+
     def _step_impl(self, t: float, dt: float) -> None:
         self._ask()
         super()._step_impl(t, dt)

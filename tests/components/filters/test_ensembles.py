@@ -1,5 +1,7 @@
 """Corrections by functions of whole ensembles: the same numbers as symbolic ones, to rounding."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -142,6 +144,32 @@ def test_a_function_of_ensembles_corrects_as_its_expression_does(update, weights
     for name in ("r_error", "q_error", "covariance", "normalized_innovation", "nis", "reason"):
         a, b = (d[f"judge.{name}"].values for d in found)
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11, err_msg=name)
+
+
+class Early(World):
+    """Measures at the start, too."""
+
+    def build_model(self):
+        model = super().build_model()
+        return replace(model, outputs={**model.outputs, "fix.valid": ca.SX(1)})
+
+    @property
+    def publishes_at_start(self):
+        return True
+
+
+def test_a_fix_at_the_start_is_weighed_as_the_expression_does():
+    found = []
+    for kind in (Plain, Whole):
+        made = system(kind(update="iterated", rate=tf.Rate("1")))
+        made.replace("world", Early())
+        made.record("first", [made.find("correct")["estimate"]], period="1")
+        found.append(tf.simulate(made, members=3, duration="3").dataset)
+    for name in ("correct.estimate.r", "correct.estimate.P"):
+        a, b = (d[name].values for d in found)
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11, err_msg=name)
+    # it corrected: nine square meters before
+    assert (found[0]["correct.estimate.P"].values[0, :, 0, 0] < 8.9).all()
 
 
 def test_a_member_alone_is_that_of_the_ensemble():
