@@ -151,3 +151,27 @@ def test_a_filter_that_is_told_nothing_cannot_restart():
     assert "restart" not in type("Untold", (FilterPredict,), {
         "error_state": ErrorState(vector("b", 1)), "process": Process()
     }).declarations  # fmt: skip
+
+
+class SmoothedPredict(Predict):
+    """With its transition."""
+
+    error_state, smoothed = STATE, True
+
+
+def test_nothing_before_a_start_anew_is_smoothed():
+    """Started again at 2 s: of fixes each second those from 3 s on; what was before was given up."""
+    with tf.System("again", duration="6") as system:
+        script = system.add(Script(t1=2.0), "script")
+        predict = system.add(SmoothedPredict(), "predict")
+        correct = system.add(Correct(), "correct")
+        system.connect(script["start"], predict["start"])
+        system.connect(script["again"], predict["restart"])
+        system.connect(script["center"], predict["center"])
+        system.connect(script["fix"], correct["fix"])
+        system.connect(predict["prior"], correct["prior"])
+        system.connect(correct["posterior"], predict["posterior"])
+        ports = ("error_transition", "transition_since", "prior")
+        system.record("all", [*(predict[n] for n in ports), correct["estimate"]], period="1")
+    smoothed = tf.smooth_run(tf.simulate(system)).dataset
+    np.testing.assert_allclose(smoothed["time"].values, [3, 4, 5, 6])
