@@ -111,6 +111,8 @@ class LakeCatalog(Component):
         except (ImportError, OSError, ValueError) as error:
             told = getattr(error, "strerror", None)
             reason = f"'{path}': {told.lower()}" if told else str(error)
+            if isinstance(error, FileNotFoundError):
+                reason += f"\n  set {self.name}.file, or TERRAFIX_DATA to the folder with the data"
             raise ConfigurationError(f"'{self.name}' cannot read its lakes: {reason}") from error
 
     def _initialize_impl(self) -> None:

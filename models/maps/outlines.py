@@ -268,6 +268,7 @@ def _cleaned(given: ArrayLike, what: str, *, outer: bool) -> FloatArray:
     _check_degrees(np.degrees(ring), what)
     ring[:, 0] = wrapped(ring[:, 0])
     p = authalic_vectors(ring[:, 0], ring[:, 1])
+    given_points = len(np.unique(p, axis=0))
     while len(ring) > 1:
         behind, ahead = np.roll(p, 1, axis=0), np.roll(p, -1, axis=0)
         drop = (p == behind).all(axis=1)
@@ -280,9 +281,11 @@ def _cleaned(given: ArrayLike, what: str, *, outer: bool) -> FloatArray:
         if not drop.any():
             break
         ring, p = ring[~drop], p[~drop]
-    n = len(np.unique(p, axis=0))
-    if n < 3:
-        raise ValueError(f"{what} has {n} distinct points, and a ring has at least three")
+    if len(np.unique(p, axis=0)) < 3:
+        lines = "" if given_points < 3 else " on a line that runs out and back"
+        raise ValueError(
+            f"{what} has {given_points} distinct points{lines}, and a ring has at least three"
+        )
     s = _vector_area(p)
     size = float(np.linalg.norm(s))
     perimeter = float(np.linalg.norm(p - np.roll(p, -1, axis=0), axis=1).sum())

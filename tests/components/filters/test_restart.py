@@ -160,7 +160,7 @@ class SmoothedPredict(Predict):
 
 
 def test_nothing_before_a_start_anew_is_smoothed():
-    """Started again at 2 s: of fixes each second those from 3 s on; what was before was given up."""
+    """Started again at 2 s: of fixes each second those from 3 s on; all before was given up."""
     with tf.System("again", duration="6") as system:
         script = system.add(Script(t1=2.0), "script")
         predict = system.add(SmoothedPredict(), "predict")

@@ -194,7 +194,10 @@ def test_what_cannot_be_read_is_one_configuration_error(file, tmp_path):
     told = refused()
     assert told.startswith("'lakes' needs a catalog of lakes\n  set lakes.file, or lakes.source to")
     told = refused(file=tmp_path / "gone.shp")
-    assert told == f"'lakes' cannot read its lakes: '{tmp_path}/gone.shp' is not there"
+    assert told == (
+        f"'lakes' cannot read its lakes: '{tmp_path}/gone.shp' is not there\n"
+        "  set lakes.file, or TERRAFIX_DATA to the folder with the data"
+    )
     assert "did you mean 'Small'?" in refused(file=file, names="Smal")
     assert "cannot select lakes: the box is empty" in refused(file=file, box="[1, 2, 3, 2] deg")
     assert "cannot select lakes: no lake has at least" in refused(
