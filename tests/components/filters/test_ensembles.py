@@ -72,7 +72,7 @@ class Judge(FilterEvaluation):
 
 
 class World(NoisyComponent):
-    """Walks and turns about the axis that looks up; every third bearing is missing."""
+    """Walks and turns; every third bearing is missing. Members see beacons in their own turns."""
 
     default_rate = tf.Rate("1")
     r = tf.Output((2,), unit="m")
@@ -99,7 +99,7 @@ class World(NoisyComponent):
             noise={"w": w},
             step=dt,
             time=t,
-            initial={"r": 3 * w[:2], "turn": 0.05 * w[2:5], "bias": 0.5 * w[5:7], "k": 0},
+            initial={"r": 3 * w[:2], "turn": 0.05 * w[2:5], "bias": 0.5 * w[5:7], "k": w[0] > 0},
             next={
                 "r": r + 0.2 * ca.sqrt(dt) * w[:2],
                 "turn": turn + ca.sqrt(1e-5 * dt) * w[2:5],

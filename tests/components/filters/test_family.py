@@ -239,6 +239,7 @@ def test_each_of_several_measurements_is_judged_by_its_own():
     both = np.where(np.isfinite(found["speed_nis"]), found["speed_nis"], 0.0)
     np.testing.assert_allclose(found["nis"], found["range_nis"] + both, rtol=1e-12)
     np.testing.assert_array_equal(found["nis_dof"][1:, 0], 20 * [1, 1, 2])
+    np.testing.assert_array_equal(found["accepted"][1:], 1.0)  # of one fix, or of both
     z = found["normalized_innovation"]
     np.testing.assert_allclose(z[:, :, 0] ** 2, found["range_nis"], rtol=1e-9)
     np.testing.assert_allclose(z[:, :, 1] ** 2, found["speed_nis"], rtol=1e-9)
@@ -513,10 +514,10 @@ class Start(tf.Component):
 
 
 def test_a_covariance_that_is_none_at_the_start_fails_that_member_alone():
-    """A correlation of 5, a variance of -1, an asymmetry; a singular one and zero are fine."""
+    """A correlation of 5, a variance below 0, an asymmetry; a singular one and zero are fine."""
     sound, wrong = [[4.0, 1.0], [1.0, 1.0]], [[1.0, 5.0], [5.0, 1.0]]
     singular, zero = [[4.0, 2.0], [2.0, 1.0]], np.zeros((2, 2))
-    negative, crooked = [[-1.0, 0.0], [0.0, 1.0]], [[4.0, 1.0], [0.5, 1.0]]
+    negative, crooked = [[-1e-12, 0.0], [0.0, 1.0]], [[4.0, 1.0], [0.5, 1.0]]
     system = tracker(predict=Told())
     start = system.add(Start(), "start")
     start.P = (sound, wrong, singular, zero, negative, crooked)

@@ -4,6 +4,8 @@ That is what a p-value is; whatever is wrong with a factor or a number of degree
 with few members.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, f, kstest, norm, sem
@@ -219,3 +221,34 @@ def test_a_bias_speaks_for_nis_too():
     unbiased = Statistics(layout())
     unbiased.add(block_of(layout(), history(e - 2.0, np.eye(1), z), first=0))
     assert judge(unbiased).words == ("overconfident",)
+
+
+def test_nis_of_innovations_that_are_alike_counts_as_that_of_one_time():
+    """1.3 in place of 1, of 100 members at 50 times: of 5,000 degrees plain, of 100 by chance.
+
+    chi2.sf(130 / 1.05^2, 100) = 0.11; of 5,000 below 1e-14.
+    """
+    from scipy.stats import chi2
+
+    sums = {
+        "nis_sum": np.full(50, 130.0),
+        "nis_n": np.full(50, 100),
+        "dof": np.full(50, 100.0),
+        "nis_of_sum": np.array([6500.0]),
+        "nis_of_n": np.array([5000]),
+        "nis_of_dof": np.array([5000.0]),
+    }
+    white, alike = layout(n_epochs=50), replace(layout(n_epochs=50), white=False)
+    found, _ = Nis().judge(white, sums, 0.01)
+    assert [f.word for f in found] == ["overconfident"]
+    assert found[0].p < 1e-14
+    assert Nis().judge(alike, sums, 0.01)[0] == []
+    found, tests = Nis().judge(alike, sums, ALL)
+    p = next(f.p for f in found if f.word == "overconfident")
+    assert p / tests == pytest.approx(chi2.sf(130 / 1.05**2, 100), rel=1e-9)
+    interval = {
+        k: Nis().summarize(lay, sums)["nis"]["interval_95"]
+        for k, lay in (("white", white), ("alike", alike))
+    }
+    np.testing.assert_allclose(interval["white"], chi2.ppf([0.025, 0.975], 5000) / 5000, rtol=1e-9)
+    np.testing.assert_allclose(interval["alike"], chi2.ppf([0.025, 0.975], 100) / 100, rtol=1e-9)
