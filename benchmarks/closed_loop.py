@@ -27,7 +27,7 @@ from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
 from terrafix.models.filters.consistency import normalized_square
-from terrafix.models.filters.spacecraft import navigation_error_array
+from terrafix.models.filters.spacecraft import STATE
 from terrafix.models.geometry.geolocation import track_axes
 from terrafix.models.images.matching import REASONS as MATCHED
 from terrafix.models.maps.dem import read_jacksboro
@@ -135,7 +135,7 @@ def outcome(system: System, number: int, members: int) -> dict[str, Any]:
         reason = at("matcher.reason", t) if "matcher.reason" in data else np.zeros(members)
         found["reason"].append(np.nan_to_num(reason))
         estimate = [at(f"correct.estimate.{k}", t) for k in ("r_e", "v_e", "q_mu")]
-        found["error"].append(navigation_error_array(r, v, q_mu, *estimate))
+        found["error"].append(STATE.difference_of_arrays(*estimate, r, v, q_mu))
         found["P"].append(at("correct.estimate.P", t))
     return {k: np.array(x) for k, x in found.items()}
 

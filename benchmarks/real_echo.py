@@ -29,7 +29,7 @@ from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
 from terrafix.models.filters.measurement import REASONS as JUDGED
-from terrafix.models.filters.spacecraft import navigation_error_array
+from terrafix.models.filters.spacecraft import STATE
 from terrafix.models.geometry.geolocation import track_axes
 from terrafix.models.images.matching import REASONS as MATCHED
 from terrafix.models.images.reference import Reference
@@ -179,7 +179,7 @@ def velocity(data: Any, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Predicted sigma, spread over members and root mean square error of velocity."""
     truth = [at(data, k, t) for k in ("orbit.r_e", "orbit.v_e", "antenna.q_mu")]
     estimate = [at(data, f"correct.estimate.{k}", t) for k in ("r_e", "v_e", "q_mu")]
-    error = navigation_error_array(*truth, *estimate)[:, 3:6]
+    error = STATE.difference_of_arrays(*estimate, *truth)[:, 3:6]
     P = at(data, "correct.estimate.P", t)
     predicted = np.sqrt(np.mean(np.diagonal(P, axis1=1, axis2=2)[:, 3:6], axis=0))
     return predicted, error.std(axis=0, ddof=1), np.sqrt(np.mean(error**2, axis=0))

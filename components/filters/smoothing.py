@@ -9,7 +9,7 @@ blocks the error state has.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,6 @@ from terrafix.cosim.basics.ensembles import chi_square_interval
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.show.numbers import number, shown_unit
 from terrafix.cosim.show.tables import Block, Shown, Table
-from terrafix.models.core.batch import over_members
 from terrafix.models.filters.consistency import normalized_square
 from terrafix.models.filters.error_state import ErrorState
 from terrafix.models.filters.smoother import Estimates, smooth
@@ -91,7 +90,8 @@ class SmoothedRun(Shown):
         headers += ["filter error", "smoothed error"] if known else []
         rows, at = [], 0
         for block in self.state:
-            unit, factor = shown_unit(str(self.dataset[f"smoothed.{block.name}"].attrs["unit"]))
+            value = str(self.dataset[f"smoothed.{block.name}"].attrs["units"])
+            unit, factor = shown_unit("rad" if block.is_rotation else value)
             for k, axis in enumerate(block.axes):
                 row = [block.name if k == 0 else "", axis, unit]
                 for kind in ("sigma", "error") if known else ("sigma",):
@@ -261,7 +261,6 @@ def _labeled(
             {
                 "units": recorded.get("units", ""),
                 "frame": recorded.get("frame", ""),
-                "unit": "rad" if block.is_rotation else recorded.get("units", ""),
             },
         )
     variables["smoothed.P"] = (("time", "member", "axis", "axis_b"), smoothed.P[kept])
@@ -272,12 +271,9 @@ def _labeled(
     truth, missing = _truth(source, correct, connections, state, axis)
     if truth:
         names = [block.name for block in state]
-        shapes = [(block.value_size,) for block in state]
-        difference = over_members(_error_of(state), *shapes, *shapes)
         for who, estimates in (("filter", filtered), ("smoothed", smoothed)):
             values = [estimates.values[name][kept] for name in names]
-            error = difference(*values, *(truth[name][kept] for name in names))
-            error = error.reshape(*values[0].shape[:2], n)
+            error = state.difference_of_arrays(*values, *(truth[name][kept] for name in names))
             nees = normalized_square(error.reshape(-1, n), estimates.P[kept].reshape(-1, n, n))
             variables[f"{who}.error"] = (("time", "member", "axis"), error)
             variables[f"{who}.nees"] = (("time", "member"), nees.reshape(error.shape[:2]))
@@ -319,16 +315,6 @@ def _truth(
         else:
             missing.append(port or f"{judge}.{block.name}")
     return ({}, missing) if missing else (found, [])
-
-
-def _error_of(state: ErrorState) -> Any:
-    names = [block.name for block in state]
-
-    def error(*values: Any) -> Any:
-        estimate: Mapping[str, Any] = dict(zip(names, values[: len(names)], strict=True))
-        return state.difference(estimate, dict(zip(names, values[len(names) :], strict=True)))
-
-    return error
 
 
 def _rms(values: FloatArray) -> list[float | None]:

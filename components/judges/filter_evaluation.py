@@ -18,7 +18,6 @@ from terrafix.components.filters.family import (
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.declare.evaluation import Evaluation, History, Quantity, consistency
 from terrafix.cosim.declare.ports import BundleInput, Input, MessageInput, Output
-from terrafix.models.core.batch import over_members
 from terrafix.models.core.model import Model
 from terrafix.models.filters.consistency import normalized_square
 from terrafix.models.filters.error_state import ErrorState
@@ -88,11 +87,7 @@ class FilterEvaluation(Evaluation):
             cls.nees_axes = len(cls._judged())
             cls.measurements = tuple(cls.observations)
             cls.white = not any(block.considered for block in state)
-            shapes = [(b.value_size,) for b in state]
-            cls._difference = staticmethod(over_members(_errors(state), *shapes, *shapes))
         super().__init_subclass__(**options)
-
-    _difference: ClassVar[Any]
 
     @classmethod
     def _measured(cls) -> dict[str, Observation]:
@@ -113,7 +108,7 @@ class FilterEvaluation(Evaluation):
         P = estimate.P[:, own][:, :, own]
         names = [block.name for block in state]
         truth = [self.port_views[name] for name in names]
-        error = self._difference(*(getattr(estimate, name) for name in names), *truth)
+        error = state.difference_of_arrays(*(getattr(estimate, name) for name in names), *truth)
         variance = np.diagonal(P, axis1=1, axis2=2)
         sigma = np.sqrt(np.where(variance > 0.0, variance, np.nan))
         for block, place in state.places.items():
@@ -168,7 +163,7 @@ class FilterEvaluation(Evaluation):
         shapes = {block.name: (block.value_size, 1) for block in state}
         inputs = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
         given = {f"estimate.{n}": ca.SX.sym(f"estimate_{n}", *s) for n, s in shapes.items()}
-        error = _errors(state)(*given.values(), *inputs.values())
+        error = state.flat_difference(*given.values(), *inputs.values())
         return Model("filter_error", inputs={**inputs, **given}, outputs={"error": error})
 
     def summarize(self, times: FloatArray, history: History) -> dict[str, Any]:
@@ -244,18 +239,6 @@ def _elements(state: ErrorState, name: str) -> range:
     """Where a block's error lies."""
     place = state.places[name]
     return range(place.start, place.stop)
-
-
-def _errors(state: ErrorState) -> Any:
-    """Estimate minus truth, of the values of all blocks, one after the other."""
-
-    def errors(*values: Any) -> Any:
-        names = [block.name for block in state]
-        estimate = dict(zip(names, values[: len(names)], strict=True))
-        truth = dict(zip(names, values[len(names) :], strict=True))
-        return state.difference(estimate, truth)
-
-    return errors
 
 
 def _fixes(t: float, accepted: FloatArray, reason: FloatArray) -> list[dict[str, Any]]:

@@ -26,13 +26,15 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 
+from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.batch import over_members
 from terrafix.models.core.symmetric import mirrored
 from terrafix.models.geometry.quaternion import (
     IDENTITY,
@@ -238,7 +240,7 @@ class ErrorState:
             at += block.size
         return found
 
-    @property
+    @cached_property
     def present(self) -> ErrorState:
         """The blocks that are of now: without clones."""
         return ErrorState(*(block for block in self.blocks if not block.clone_of))
@@ -290,6 +292,26 @@ class ErrorState:
     def difference(self, values: Values, others: Values) -> Any:
         """The error (n, 1) that takes `others` to `values`."""
         return ca.vertcat(*(b.minus(values[b.name], others[b.name]) for b in self.blocks))
+
+    def flat_difference(self, *values: Any) -> Any:
+        """`difference` of the values of all blocks and then of the others', one by one."""
+        names = [block.name for block in self.blocks]
+        one, other = values[: len(names)], values[len(names) :]
+        return self.difference(
+            dict(zip(names, one, strict=True)), dict(zip(names, other, strict=True))
+        )
+
+    @cached_property
+    def difference_of_arrays(self) -> Callable[..., FloatArray]:
+        """`flat_difference` of arrays (..., size): errors (..., n)."""
+        shapes = [(block.value_size,) for block in self.blocks]
+        found = over_members(self.flat_difference, *shapes, *shapes)
+
+        def difference(*values: FloatArray) -> FloatArray:
+            errors: FloatArray = found(*values)
+            return errors if self.size > 1 else errors[..., None]
+
+        return difference
 
     def recentering(self, correction: Any) -> Any:
         """Derivative (n, n) of the error about a corrected estimate by that about the prior.

@@ -146,17 +146,10 @@ class _Algebra:
         shapes = [(block.value_size,) for block in state]
         names = [block.name for block in state]
 
-        def difference(*values: Any) -> Any:
-            n = len(names)
-            return state.difference(
-                dict(zip(names, values[:n], strict=True)), dict(zip(names, values[n:], strict=True))
-            )
-
         def retract(error: Any, *values: Any) -> Any:
             moved = state.normalized(state.retract(dict(zip(names, values, strict=True)), error))
             return tuple(moved[name] for name in names)
 
-        self._difference = over_members(difference, *shapes, *shapes)
         self._retract = over_members(retract, (state.size,), *shapes)
 
     @cached_property
@@ -176,7 +169,7 @@ class _Algebra:
         """Smoothed values and covariance, from those at the next time."""
         m, n = gain.shape[:2]
         values, P = posterior
-        error = self._difference(*later[0].values(), *prior[0].values()).reshape(m, n)
+        error = self._state.difference_of_arrays(*later[0].values(), *prior[0].values())
         correction = (gain @ error[:, :, None])[:, :, 0]
         moved = self._retract(correction, *values.values())
         moved = moved if isinstance(moved, tuple) else (moved,)

@@ -28,7 +28,6 @@ from typing import Any
 
 import casadi as ca
 
-from terrafix.models.core.batch import over_members
 from terrafix.models.core.model import Model, rk4
 from terrafix.models.core.symmetric import mirrored
 from terrafix.models.filters.error_state import ErrorState, Values, rotation, vector
@@ -312,13 +311,3 @@ def sar_observation(in_track: str = "speed") -> Observation:
         inputs={"q_be": 4},
         parameters={"look": 1, "squint": 1},
     )
-
-
-def _navigation_error(*values: Any) -> Any:
-    names = [block.name for block in STATE]
-    truth, estimate = (dict(zip(names, part, strict=True)) for part in (values[:3], values[3:]))
-    return STATE.difference(estimate, truth)
-
-
-navigation_error_array = over_members(_navigation_error, (3,), (3,), (4,), (3,), (3,), (4,))
-"""Estimate minus truth (m, 9) of arrays of truth and estimate: r_e, v_e, q_mu; r_e, v_e, q_mu."""

@@ -540,3 +540,40 @@ def test_a_clone_that_was_not_made_yet_or_is_too_old_says_why():
     assert accepted == [21.0]
     assert {fix["reason"] for fix in fixes} == {"accepted", "not of this instant"}
     assert len(fixes) == 30
+
+
+def test_a_filter_of_one_state_is_evaluated():
+    """A random walk that is measured: its error has an axis like any other; NEES is chi-square."""
+    one = ErrorState(vector("x", 1, unit="m"))
+
+    class Walks:
+        default_rate = tf.Rate("1")
+        error_state, process = one, Process(walks={"x": "psd"})
+        psd = tf.Parameter(1.0, unit="m^2/s")
+        x_sigma0 = tf.Parameter(3.0, unit="m")
+
+    class Seen:
+        default_rate = tf.Rate("1", offset="1")
+        error_state, observation = one, Observation(lambda x, _: x["x"], {"place": "m"})
+
+    def made(*bases, **settings):
+        return type(bases[-1].__name__[6:], bases, {"__doc__": "Own."})(**settings)
+
+    with tf.System("one", duration="10", seed=2) as system:
+        truth = system.add(made(Walks, tf.filters.FilterTruth), "truth")
+        sensor = system.add(made(Seen, tf.filters.FilterSensor, sigma=2.0), "sensor")
+        predict = system.add(made(Walks, FilterPredict), "predict")
+        correct = system.add(made(Seen, FilterCorrect), "correct")
+        judge = system.add(made(Seen, FilterEvaluation, rate=tf.Rate("1")), "judge")
+        system.connect(truth["x"], sensor["x"])
+        system.connect(truth["x"], judge["x"])
+        system.connect(sensor["fix"], correct["fix"])
+        system.connect(predict["prior"], correct["prior"])
+        system.connect(correct["posterior"], predict["posterior"])
+        system.connect(correct["estimate"], judge["estimate"])
+        system.connect(correct["innovation"], judge["innovation"])
+    found = tf.simulate(system, members=400).dataset
+    low, high = chi2.ppf([0.0005, 0.9995], 400) / 400
+    for epoch in (1, 5, 10):
+        assert low < found["judge.nees"].values[epoch].mean() < high
+    assert found["judge.x_error"].shape == (11, 400, 1)

@@ -6,8 +6,8 @@ import pytest
 from scipy.linalg import expm
 
 from terrafix.models.filters.spacecraft import (
+    STATE,
     mekf_predict_model,
-    navigation_error_array,
     transition_matrix,
 )
 from terrafix.models.geometry.earth import EARTH
@@ -172,8 +172,8 @@ def test_start_is_the_last_known_state(start_e, constants):
 def test_reported_error_is_estimate_minus_truth():
     truth, turn = from_rotation_vector_array([1.0, 2.0, -1.0]), np.array([0.01, -0.02, 0.03])
     estimate = product_array(from_rotation_vector_array(turn), truth)
-    error = navigation_error_array(
-        [1.0, 2, 3], [4.0, 5, 6], truth, [11.0, 2, 3], [4.0, 5, 5], estimate
+    error = STATE.difference_of_arrays(
+        [11.0, 2, 3], [4.0, 5, 5], estimate, [1.0, 2, 3], [4.0, 5, 6], truth
     )
     np.testing.assert_allclose(error, [10, 0, 0, 0, 0, -1, *turn], atol=1e-15)
 
