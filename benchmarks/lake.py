@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import terrafix as tf
-from terrafix.models.filters.lake import CAMERA, Seen
+from terrafix.models.sensors.camera import CAMERA, Seen
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 TEN_HZ = tuple(

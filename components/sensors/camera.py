@@ -22,19 +22,14 @@ from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, Parameter
 from terrafix.cosim.declare.ports import Input, MessageInput, MessageOutput, Output, SharedInput
-from terrafix.models.core.batch import over_members
-from terrafix.models.filters.lake import CAMERA, Seen
-from terrafix.models.filters.measurement import TIME
 from terrafix.models.geometry.earth import EARTH
-from terrafix.models.geometry.frames import rotate_about_pole
 from terrafix.models.images.rendering import (
     Appearance,
     cloud_opacity,
     render_polygon,
     render_scene,
 )
-
-rotate_about_pole_array = over_members(rotate_about_pole, (), (3,))
+from terrafix.models.sensors.camera import CAMERA, Seen, in_view
 
 CLIPPING = ("frame", "none")
 """What becomes of an outline that is not wholly in the frame."""
@@ -125,7 +120,7 @@ class LakeCamera(Component):
         if self._moved is not None:
             points = points + self._moved[rows, begin:end]
         values = {"r": self.r_i[rows], "v": self.v_i[rows], "attitude": self.attitude[rows]}
-        given = {name: getattr(self, name)[rows] for name in CAMERA} | {TIME: np.full(len(rows), t)}
+        given = {name: getattr(self, name)[rows] for name in CAMERA} | {"t": np.full(len(rows), t)}
         seen = Seen(values, given, points, self.center[lake])
         inside = seen.depth > 0.0
         if self.clipping == "frame":
@@ -135,16 +130,10 @@ class LakeCamera(Component):
 
     def _candidates(self, t: float) -> NDArray[np.int64]:
         """Lakes that may be in each member's frame, nearest to the axis first; -1 for none."""
+        clipped = self.clipping == "frame"
+        reach = np.linalg.norm(self.size, axis=1) / self.focal if clipped else self.focal * np.inf
         angle = self.earth_angle0 + self.rotation_rate * t
-        r_e = rotate_about_pole_array(angle, self.r_i)
-        down = -r_e / np.linalg.norm(r_e, axis=1, keepdims=True)
-        off = self.center - r_e[:, None]
-        depth = np.einsum("mld,md->ml", off, down)
-        across = np.linalg.norm(off - depth[..., None] * down[:, None], axis=2)
-        seen = np.einsum("ld,mld->ml", self.center, off) < 0.0  # above the horizon
-        if self.clipping == "frame":
-            reach = np.linalg.norm(self.size, axis=1) / self.focal
-            seen &= across - self.radius < reach[:, None] * depth
+        seen, across = in_view(self.r_i, angle, self.center, self.radius, reach)
         seen &= self.environment.active[:, None]
         order = np.argsort(np.where(seen, across, np.inf), axis=1)[:, :_NEAREST]
         return np.where(np.take_along_axis(seen, order, axis=1), order, -1)

@@ -30,19 +30,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from terrafix.models.core.arrays import FloatArray
-from terrafix.models.core.batch import over_members
 from terrafix.models.filters.ensembles import Arrays, EnsembleObservation
 from terrafix.models.filters.error_state import ErrorState, considered, vector
 from terrafix.models.filters.measurement import TIME
 from terrafix.models.filters.process import Process
-from terrafix.models.geometry.frames import rotate_about_pole
 from terrafix.models.images.polygons import moments
 from terrafix.models.motion.gravity import j2_acceleration
-from terrafix.models.sensors.camera import nadir_axes, pixel, turned
+from terrafix.models.sensors.camera import CAMERA, STATE_SIZES, Seen
 
 ORBIT = ErrorState(vector("r", unit="m", frame="i"), vector("v", unit="m/s", frame="i"))
 """Position and velocity, inertial."""
@@ -67,11 +64,6 @@ MOMENTS = {
 CATALOG = ("vertices", "starts", "center")
 """Shared arrays of a lake catalog: all vertices, where each lake's begin, the lakes' middles."""
 
-CAMERA = {"focal": 1, "principal": 2, "earth_angle0": 1, "rotation_rate": 1}
-"""Parameters of what a camera sees of the ground."""
-
-_STATE = {"r": 3, "v": 3, "attitude": 3, "scale": 1}
-
 
 def orbit_process() -> Process:
     """Gravity with the second zonal harmonic, and white acceleration."""
@@ -86,80 +78,12 @@ def orbit_process() -> Process:
     )
 
 
-def _view(r: Any, v: Any, attitude: Any, earth_angle: Any) -> Any:
-    """Rotation C (3, 3) from Earth-fixed to camera axes and offset o (3,); their derivatives."""
-    axes = turned(nadir_axes(r, v), attitude)
-    poles = [rotate_about_pole(-earth_angle, ca.SX.eye(3)[:, k]) for k in range(3)]
-    C, offset = ca.mtimes(axes, ca.horzcat(*poles)), ca.mtimes(axes, r)
-    x = ca.vertcat(r, v, attitude)
-    return C, offset, ca.jacobian(ca.vec(C.T), x), ca.jacobian(offset, x)
-
-
-def _pixel(d: Any, focal: Any, principal: Any) -> Any:
-    found = pixel(d, focal, principal)
-    return found, ca.jacobian(found, d)
-
-
-_VIEW = over_members(_view, (3,), (3,), (3,), ())
-_PIXEL = over_members(_pixel, (3,), (), (2,))
-
-
-class Seen:
-    """An outline as k estimates see it.
-
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (k, size)
-        ``r``, ``v``; ``attitude`` and ``scale``, zero where absent.
-    given : mapping of str to ndarray, shape (k, size)
-        `CAMERA`, and the time ``t``.
-    points : ndarray, shape (K, 3) or (k, K, 3)
-        Earth-fixed vertices [m].
-    middle : ndarray, shape (3,)
-        Earth-fixed point that scale is about [m].
-
-    Attributes
-    ----------
-    depth : ndarray, shape (k, K)
-        Along the optical axis [m]; what is behind the camera has a negative one.
-    pixels : ndarray, shape (k, K, 2)
-    """
-
-    def __init__(
-        self, values: Arrays, given: Arrays, points: FloatArray, middle: FloatArray
-    ) -> None:
-        k = len(values["r"])
-        r, v, attitude, scale = (
-            np.reshape(values.get(name, np.zeros((k, size))), (k, size))
-            for name, size in _STATE.items()
-        )
-        told = {name: np.reshape(given[name], (k, -1)) for name in (*CAMERA, TIME)}
-        angle = told["earth_angle0"] + told["rotation_rate"] * told[TIME]
-        self._C, offset, self._dC, self._do = _VIEW(r, v, attitude, angle[:, 0])
-        self._off_middle = points - middle
-        self._q = points + scale[:, :, None] * self._off_middle
-        d = self._q @ self._C.transpose(0, 2, 1) - offset[:, None]
-        self.depth = d[..., 2]
-        self.pixels, self._by_d = _PIXEL(d, told["focal"], told["principal"][:, None])
-
-    def derivative(self, by_pixels: FloatArray) -> FloatArray:
-        """Derivative (k, m, 10) by r, v, attitude, scale of what has this one (k, m, K, 2)."""
-        k, m, n_vertices, _ = by_pixels.shape
-        by_d = np.ascontiguousarray(self._by_d.transpose(0, 2, 3, 1))[:, None]  # (k, 1, 2, 3, K)
-        u, v = (np.ascontiguousarray(by_pixels[..., i])[:, :, None] for i in range(2))
-        G = (u * by_d[:, :, 0] + v * by_d[:, :, 1]).reshape(k, m * 3, n_vertices)
-        by_C = (G @ self._q).reshape(k, m, 9)
-        found = by_C @ self._dC - G.sum(axis=2).reshape(k, m, 3) @ self._do
-        about = (G @ self._off_middle).reshape(k, m, 9) @ self._C.reshape(k, 9, 1)
-        return np.concatenate([found, about], axis=2)
-
-
 def lake_observation(state: ErrorState) -> EnsembleObservation:
     """Moments of the outline of a lake of the catalog, which the fix names by its number.
 
     Of blocks of `CONSIDERED`, whichever `state` has.
     """
-    begins = dict(zip(_STATE, np.cumsum([0, *_STATE.values()]), strict=False))
+    begins = dict(zip(STATE_SIZES, np.cumsum([0, *STATE_SIZES.values()]), strict=False))
     columns = [begins[block.name] + i for block in state for i in range(block.size)]
 
     def each_lake(values: Arrays, given: Arrays) -> Iterator[tuple[Any, Seen]]:

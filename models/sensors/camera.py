@@ -25,13 +25,17 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import tan
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
-DISTORTIONS = ("none", "brown")
-"""Names of lenses."""
+from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.batch import over_members
+from terrafix.models.geometry.frames import rotate_about_pole
 
 BROWN = ("k1", "k2", "k3", "p1", "p2")
 """Coefficients of Brown's distortion, in this order."""
@@ -88,3 +92,122 @@ def pixel(d: Any, focal: Any, center: Any, lens: Any | None = None) -> Any:
         )
         x, y = bent[0], bent[1]
     return center + focal * ca.vertcat(x, y)
+
+
+CAMERA = {"focal": 1, "principal": 2, "earth_angle0": 1, "rotation_rate": 1}
+"""Parameters of what a camera sees of the ground."""
+
+STATE_SIZES = {"r": 3, "v": 3, "attitude": 3, "scale": 1}
+"""What a look depends on: position, velocity, misalignment, scale of outlines."""
+
+
+def _view(r: Any, v: Any, attitude: Any, earth_angle: Any) -> Any:
+    """Rotation C (3, 3) from Earth-fixed to camera axes and offset o (3,); their derivatives."""
+    axes = turned(nadir_axes(r, v), attitude)
+    poles = [rotate_about_pole(-earth_angle, ca.SX.eye(3)[:, k]) for k in range(3)]
+    C, offset = ca.mtimes(axes, ca.horzcat(*poles)), ca.mtimes(axes, r)
+    x = ca.vertcat(r, v, attitude)
+    return C, offset, ca.jacobian(ca.vec(C.T), x), ca.jacobian(offset, x)
+
+
+def _pixel(d: Any, focal: Any, principal: Any) -> Any:
+    found = pixel(d, focal, principal)
+    return found, ca.jacobian(found, d)
+
+
+_EARTH_FIXED = over_members(rotate_about_pole, (), (3,))
+_VIEW = over_members(_view, (3,), (3,), (3,), ())
+_PIXEL = over_members(_pixel, (3,), (), (2,))
+
+
+class Seen:
+    """An outline as k estimates see it.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray, shape (k, size)
+        ``r``, ``v``; ``attitude`` and ``scale``, zero where absent.
+    given : mapping of str to ndarray, shape (k, size)
+        `CAMERA`, and the time ``t`` [s].
+    points : ndarray, shape (K, 3) or (k, K, 3)
+        Earth-fixed vertices [m].
+    middle : ndarray, shape (3,)
+        Earth-fixed point that scale is about [m].
+
+    Attributes
+    ----------
+    depth : ndarray, shape (k, K)
+        Along the optical axis [m]; what is behind the camera has a negative one.
+    pixels : ndarray, shape (k, K, 2)
+    """
+
+    def __init__(
+        self,
+        values: Mapping[str, FloatArray],
+        given: Mapping[str, FloatArray],
+        points: FloatArray,
+        middle: FloatArray,
+    ) -> None:
+        k = len(values["r"])
+        r, v, attitude, scale = (
+            np.reshape(values.get(name, np.zeros((k, size))), (k, size))
+            for name, size in STATE_SIZES.items()
+        )
+        told = {name: np.reshape(given[name], (k, -1)) for name in (*CAMERA, "t")}
+        angle = told["earth_angle0"] + told["rotation_rate"] * told["t"]
+        self._C, offset, self._dC, self._do = _VIEW(r, v, attitude, angle[:, 0])
+        self._off_middle = points - middle
+        self._q = points + scale[:, :, None] * self._off_middle
+        d = self._q @ self._C.transpose(0, 2, 1) - offset[:, None]
+        self.depth = d[..., 2]
+        self.pixels, self._by_d = _PIXEL(d, told["focal"], told["principal"][:, None])
+
+    def derivative(self, by_pixels: FloatArray) -> FloatArray:
+        """Derivative (k, m, 10) by r, v, attitude, scale of what has this one (k, m, K, 2)."""
+        k, m, n_vertices, _ = by_pixels.shape
+        by_d = np.ascontiguousarray(self._by_d.transpose(0, 2, 3, 1))[:, None]  # (k, 1, 2, 3, K)
+        u, v = (np.ascontiguousarray(by_pixels[..., i])[:, :, None] for i in range(2))
+        G = (u * by_d[:, :, 0] + v * by_d[:, :, 1]).reshape(k, m * 3, n_vertices)
+        by_C = (G @ self._q).reshape(k, m, 9)
+        found = by_C @ self._dC - G.sum(axis=2).reshape(k, m, 3) @ self._do
+        about = (G @ self._off_middle).reshape(k, m, 9) @ self._C.reshape(k, 9, 1)
+        return np.concatenate([found, about], axis=2)
+
+
+def in_view(
+    r: FloatArray,
+    earth_angle: FloatArray,
+    centers: FloatArray,
+    radii: FloatArray,
+    reach: FloatArray,
+) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Which circles on the ground a camera that looks down may see, and how far off its axis.
+
+    Parameters
+    ----------
+    r : ndarray, shape (k, 3)
+        Positions, inertial [m].
+    earth_angle : ndarray, shape (k,)
+        [rad]
+    centers : ndarray, shape (L, 3)
+        Earth-fixed [m].
+    radii : ndarray, shape (L,)
+        [m]
+    reach : ndarray, shape (k,)
+        Largest tangent of the angle off the axis that the frame shows; infinity: up to the horizon.
+
+    Returns
+    -------
+    seen : ndarray of bool, shape (k, L)
+    across : ndarray, shape (k, L)
+        Distance from the axis [m].
+    """
+    r_e = _EARTH_FIXED(earth_angle, r)
+    down = -r_e / np.linalg.norm(r_e, axis=1, keepdims=True)
+    off = centers - r_e[:, None]
+    depth = np.einsum("kld,kd->kl", off, down)
+    across = np.linalg.norm(off - depth[..., None] * down[:, None], axis=2)
+    above_horizon = np.einsum("ld,kld->kl", centers, off) < 0.0
+    with np.errstate(invalid="ignore"):
+        in_frame = np.isinf(reach)[:, None] | (across - radii < reach[:, None] * depth)
+    return above_horizon & in_frame, across

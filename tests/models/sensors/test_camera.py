@@ -7,10 +7,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from terrafix.models.filters.lake import CONSIDERED, ORBIT, Seen, lake_observation
+from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
 from terrafix.models.geometry.geodesy import ecef
 from terrafix.models.images.polygons import moments
-from terrafix.models.sensors.camera import focal_length, nadir_axes, pixel, turned
+from terrafix.models.sensors.camera import Seen, focal_length, in_view, nadir_axes, pixel, turned
 
 DATA = Path(os.environ.get("TERRAFIX_DATA", Path(__file__).parents[4] / "shared" / "data"))
 R0 = np.array([3477.4e3, -3719.3e3, 4698.1e3])  # of the paper [m]
@@ -173,3 +173,22 @@ def test_rows_of_several_lakes_are_those_of_each():
         np.testing.assert_allclose(
             both[row], lake_observation(ORBIT).predict(one, alone)[0], rtol=1e-13
         )
+
+
+def test_what_may_be_in_view_is_near_the_axis_and_above_the_horizon():
+    """From 700 km over the equator, reach 0.1: a circle below, one 100 km off, the antipode."""
+    radius = 6_378e3
+    off = 100e3 / radius
+    centers = radius * np.array(
+        [[1.0, 0, 0], [np.cos(off), np.sin(off), 0], [-1.0, 0, 0], [0, 1.0, 0]]
+    )
+    r = np.array([[radius + 700e3, 0.0, 0.0]])
+    seen, across = in_view(r, np.zeros(1), centers, np.zeros(4), np.array([0.1]))
+    assert seen.tolist() == [[True, False, False, False]]
+    np.testing.assert_allclose(across[0, :2], [0.0, radius * np.sin(off)], atol=1e-6)
+    wide, _ = in_view(r, np.zeros(1), centers, np.full(4, 40e3), np.array([0.1]))
+    assert wide.tolist() == [[True, True, False, False]]  # 100 km less 40 are within 70 km
+    whole, _ = in_view(r, np.zeros(1), centers, np.zeros(4), np.array([np.inf]))
+    assert whole.tolist() == [[True, True, False, False]]
+    turned_by, _ = in_view(r, np.array([np.pi]), centers, np.zeros(4), np.array([0.1]))
+    assert turned_by.tolist() == [[False, False, True, False]]
