@@ -28,7 +28,7 @@ from terrafix.cosim.system.identity import first_difference
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-SCHEMA = "terrafix-campaign/1"
+SCHEMA = "terrafix-campaign/2"
 MANIFEST = "campaign.json"
 RESULT = "result.nc"
 SUMMARY = "summary.json"
