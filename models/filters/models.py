@@ -78,19 +78,7 @@ def predict_model(
         If a block is neither told nor has a sigma, or both, or does not exist; or it restarts
         and no block is told.
     """
-    names = [block.name for block in state]
-    for block in [*told, *sigmas]:
-        if block not in names:
-            raise ValueError(
-                f"filter '{name}' starts '{block}', which is no block; the blocks are "
-                f"{', '.join(names)}"
-            )
-    for block in (block.name for block in state if not block.clone_of):
-        if (block in told) == (block in sigmas):
-            raise ValueError(
-                f"block '{block}' of filter '{name}' starts from a message or from a sigma: "
-                "say one of them"
-            )
+    _check_start(name, state, told, sigmas)
     inputs = {key: ca.SX.sym(key, size) for key, size in process.inputs.items()}
     parameters = {key: ca.SX.sym(key, size) for key, size in process.named().items()}
     own, posterior = state.symbols("own"), state.symbols("posterior")
@@ -152,6 +140,25 @@ def predict_model(
         step=step,
         time=time if uses_time else None,
     )
+
+
+def _check_start(
+    name: str, state: ErrorState, told: Sequence[str], sigmas: Mapping[str, str]
+) -> None:
+    """Raise ValueError if a block is neither told nor has a sigma, or both, or does not exist."""
+    names = [block.name for block in state]
+    for block in [*told, *sigmas]:
+        if block not in names:
+            raise ValueError(
+                f"filter '{name}' starts '{block}', which is no block; the blocks are "
+                f"{', '.join(names)}"
+            )
+    for block in (block.name for block in state if not block.clone_of):
+        if (block in told) == (block in sigmas):
+            raise ValueError(
+                f"block '{block}' of filter '{name}' starts from a message or from a sigma: "
+                "say one of them"
+            )
 
 
 def _start(

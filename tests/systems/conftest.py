@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from terrafix.cosim.declare.component import Component
@@ -68,3 +69,18 @@ def skeleton():
         check_determinism=check_determinism,
         check_resume=check_resume,
     )
+
+
+@pytest.fixture(scope="module")
+def outline(tmp_path_factory):
+    """A lake of one's own: long, bent and with bays, some 50 km by 2, where the track goes."""
+    t = np.linspace(0.0, 1.0, 60)
+    middle = -76.93 + 0.06 * np.sin(3 * t)
+    width = 0.007 + 0.01 * np.sin(np.pi * t) * (1 + 0.4 * np.cos(20 * t))
+    latitude = 42.41 + 0.45 * t
+    east = np.column_stack([middle + width, latitude])
+    west = np.column_stack([middle - width, latitude])[::-1]
+    ring = np.concatenate([east, west, east[:1]])
+    file = tmp_path_factory.mktemp("lake") / "own.csv"
+    np.savetxt(file, ring, delimiter=",", header="lon,lat", comments="", fmt="%.6f")
+    return file

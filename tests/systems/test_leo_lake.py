@@ -17,21 +17,6 @@ PARTS = ("predict", "correct", "evaluation")
 TEN_HZ = [(f"{n}.period", "0.1 s") for n in ("orbit", "camera", "moments", *PARTS)]
 
 
-@pytest.fixture(scope="module")
-def outline(tmp_path_factory):
-    """A lake of one's own: long, bent and with bays, some 50 km by 2, where the track goes."""
-    t = np.linspace(0.0, 1.0, 60)
-    middle = -76.93 + 0.06 * np.sin(3 * t)
-    width = 0.007 + 0.01 * np.sin(np.pi * t) * (1 + 0.4 * np.cos(20 * t))
-    latitude = 42.41 + 0.45 * t
-    east = np.column_stack([middle + width, latitude])
-    west = np.column_stack([middle - width, latitude])[::-1]
-    ring = np.concatenate([east, west, east[:1]])
-    file = tmp_path_factory.mktemp("lake") / "own.csv"
-    np.savetxt(file, ring, delimiter=",", header="lon,lat", comments="", fmt="%.6f")
-    return file
-
-
 def read(outline, *settings, case="T3", file=LAKE):
     return tf.read_system(file, [("lakes.file", str(outline)), ("case", case), *settings])
 

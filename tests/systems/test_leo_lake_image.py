@@ -13,21 +13,6 @@ ROOT = Path(__file__).parents[2]
 IMAGE = ROOT / "examples" / "leo_lake_image.toml"
 
 
-@pytest.fixture(scope="module")
-def outline(tmp_path_factory):
-    """A lake of one's own: long and bent, some 50 km by 3, where the track goes."""
-    t = np.linspace(0.0, 1.0, 40)
-    middle = -76.93 + 0.05 * np.sin(3 * t)
-    width = 0.012 + 0.012 * np.sin(np.pi * t)
-    latitude = 42.41 + 0.45 * t
-    east = np.column_stack([middle + width, latitude])
-    west = np.column_stack([middle - width, latitude])[::-1]
-    ring = np.concatenate([east, west, east[:1]])
-    file = tmp_path_factory.mktemp("lake") / "own.csv"
-    np.savetxt(file, ring, delimiter=",", header="lon,lat", comments="", fmt="%.6f")
-    return file
-
-
 EVERY = [(f"{n}.period", "1 s") for n in ("camera", "imager", "moments", "correct", "evaluation")]
 
 
