@@ -135,6 +135,25 @@ LAKE_FIX = {
 }
 """A fix from one look at a lake."""
 
+ORBIT_ESTIMATE = {
+    "r": Field((3,), "m", "i", labels=XYZ, doc="position"),
+    "v": Field((3,), "m/s", "i", labels=XYZ, doc="velocity"),
+    "P": Field((6, 6), "1", doc="covariance of position [m] and velocity [m/s] error"),
+}
+"""What a filter of an orbit knows."""
+
+SHORE_VERTICES = 256
+"""Of an outline that shores are matched to."""
+
+SHORE_FIX = {
+    "y": Field((6,), "1", doc="weighted sums of the pixels of a shore, in sigmas of their noise"),
+    "lake": Field((1,), "1", doc="number of the lake in its catalog"),
+    "weights": Field((6 * SHORE_VERTICES * 2,), "1/px", doc="sum, vertex of its outline, axis"),
+    "R": Field((6, 6), "1", doc="covariance of the noise of y"),
+    "present": Field((6,), "1", doc="1 where the shore tells a sum, else 0"),
+}
+"""A fix from what is seen of a lake's shore."""
+
 CORNERS: dict[str, Any] = {"shape": (None, 3), "unit": "m", "frame": "e"}
 """Vertices of the rings of all lakes, one ring after the other, not closed."""
 

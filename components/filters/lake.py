@@ -9,6 +9,7 @@ from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import SharedInput
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation, orbit_process
+from terrafix.models.filters.shore import shore_observation
 from terrafix.models.geometry.earth import EARTH
 
 
@@ -50,6 +51,12 @@ class LakeCorrect(EnsembleCorrect):
     vertices = SharedInput(**CORNERS, doc="of the rings of all lakes")
     starts = SharedInput(**STARTS, doc="of rings in the vertices")
     center = SharedInput(**CENTERS, doc="of each lake")
+
+
+class ShoreCorrect(LakeCorrect):
+    """Correction of an orbit by the shore of a lake of which a part is in the frame."""
+
+    error_state, observation = ORBIT, shore_observation(ORBIT)
 
 
 class ConsideredLakeCorrect(LakeCorrect):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from terrafix.components.judges.filter_evaluation import FilterEvaluation
 from terrafix.cosim.basics.clock import Rate
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
+from terrafix.models.filters.shore import shore_observation
 from terrafix.models.filters.spacecraft import STATE, sar_observation
 
 
@@ -22,6 +23,12 @@ class OrbitEvaluation(FilterEvaluation):
     default_rate = Rate("1/30")
     error_state, observation, judged = ORBIT, lake_observation(ORBIT), ("r",)
     called = {"r": "position", "v": "velocity"}  # noqa: RUF012
+
+
+class ShoreOrbitEvaluation(OrbitEvaluation):
+    """The same of a filter that is corrected by shores seen in part."""
+
+    error_state, observation = ORBIT, shore_observation(ORBIT)
 
 
 class ConsideredOrbitEvaluation(OrbitEvaluation):

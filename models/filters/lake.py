@@ -78,23 +78,29 @@ def orbit_process() -> Process:
     )
 
 
+def state_columns(state: ErrorState) -> list[int]:
+    """Columns of a derivative of `Seen` that are of the blocks of a state, in its order."""
+    begins = dict(zip(STATE_SIZES, np.cumsum([0, *STATE_SIZES.values()]), strict=False))
+    return [begins[block.name] + i for block in state for i in range(block.size)]
+
+
+def outlines_seen(values: Arrays, given: Arrays) -> Iterator[tuple[Any, Seen]]:
+    """Rows of the estimates that look at one lake, and its outline, lake by lake."""
+    lakes = np.asarray(given["lake"]).reshape(-1).astype(np.int64)
+    for lake in np.unique(lakes):
+        rows = np.flatnonzero(lakes == lake)
+        begin, end = np.asarray(given["starts"][lake : lake + 2], dtype=np.int64)
+        own = {n: v[rows] for n, v in values.items()}
+        told = {n: given[n][rows] for n in (*CAMERA, TIME)}
+        yield rows, Seen(own, told, given["vertices"][begin:end], given["center"][lake])
+
+
 def lake_observation(state: ErrorState) -> EnsembleObservation:
     """Moments of the outline of a lake of the catalog, which the fix names by its number.
 
     Of blocks of `CONSIDERED`, whichever `state` has.
     """
-    begins = dict(zip(STATE_SIZES, np.cumsum([0, *STATE_SIZES.values()]), strict=False))
-    columns = [begins[block.name] + i for block in state for i in range(block.size)]
-
-    def each_lake(values: Arrays, given: Arrays) -> Iterator[tuple[Any, Seen]]:
-        """Rows of the estimates that look at one lake, and its outline, lake by lake."""
-        lakes = np.asarray(given["lake"]).reshape(-1).astype(np.int64)
-        for lake in np.unique(lakes):
-            rows = np.flatnonzero(lakes == lake)
-            begin, end = np.asarray(given["starts"][lake : lake + 2], dtype=np.int64)
-            own = {n: v[rows] for n, v in values.items()}
-            told = {n: given[n][rows] for n in (*CAMERA, TIME)}
-            yield rows, Seen(own, told, given["vertices"][begin:end], given["center"][lake])
+    columns = state_columns(state)
 
     # both are asked of the same estimates: what they see is kept from one to the other
     kept: list[tuple[Arrays, list[Any]]] = []
@@ -103,7 +109,7 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
         last = kept[:]  # another thread may put its own there meanwhile
         if last and last[0][0] is values:
             return last[0][1]
-        looks = [(*look, *moments(look[1].pixels)) for look in each_lake(values, given)]
+        looks = [(*look, *moments(look[1].pixels)) for look in outlines_seen(values, given)]
         kept[:] = [(values, looks)]
         return looks
 

@@ -37,6 +37,7 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
         "lake_correct",
         "lake_correct_considered",
     ),
+    *("shore_matcher", "shore_correct", "orbit_evaluation_shore"),  # in systems/test_leo_lake_shore
     *("last_known_orbit", "orbit_evaluation", "orbit_evaluation_considered"),
     *("orbit_predict", "orbit_predict_considered"),  # in systems/test_leo_lake
 }

@@ -81,10 +81,10 @@ SYSTEM_MISTAKES = {
         "lake_catalog, lake_correct, lake_correct_considered, lake_imager, last_known_orbit, "
         "last_known_state, linear, lvlh_attitude, mekf_correct, mekf_predict, "
         "mekf_predict_smoothed, navigation_evaluation, orbit, orbit_evaluation, "
-        "orbit_evaluation_considered, orbit_predict, orbit_predict_considered, "
-        "recorded_attitude, recorded_echo, recorded_imu, recorded_orbit, recorded_reference, "
-        "reference_file, scene_echo, "
-        "synthetic_sar_fix, terrain",
+        "orbit_evaluation_considered, orbit_evaluation_shore, orbit_predict, "
+        "orbit_predict_considered, recorded_attitude, recorded_echo, recorded_imu, "
+        "recorded_orbit, recorded_reference, reference_file, scene_echo, "
+        "shore_correct, shore_matcher, synthetic_sar_fix, terrain",
     ),
     "table that is misspelled": edit(
         "[component.orbit]",

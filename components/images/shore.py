@@ -1,0 +1,114 @@
+"""The shore of a lake in a frame, matched to the catalog from the filter's own estimate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrafix.components.fields import (
+    CENTERS,
+    CONTOUR,
+    CORNERS,
+    LOOK,
+    ORBIT_ESTIMATE,
+    SHORE_FIX,
+    SHORE_VERTICES,
+    STARTS,
+)
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import (
+    BundleInput,
+    MessageInput,
+    MessageOutput,
+    Output,
+    SharedInput,
+)
+from terrafix.models.filters.shore import SHORE_REASONS, Shore, match_shore
+from terrafix.models.geometry.earth import EARTH
+from terrafix.models.images.shore import ELEMENTS, Weights
+from terrafix.models.sensors.camera import CAMERA
+
+
+class ShoreMatcher(Component):
+    """Finds what a frame shows of a lake's shore on the catalog's outline, and makes it a fix.
+
+    It needs no whole lake in the frame. What lies outside of the frame is not used, and the ends
+    of the shore, where it leaves the frame, are no shore.
+    """
+
+    default_rate = Rate("1/30")
+
+    focal = Parameter(unit="px", positive=True, doc="focal length of the camera")
+    size = Parameter([320.0, 256.0], shape=(2,), unit="px", positive=True, doc="of the frame")
+    principal = Parameter([160.0, 128.0], shape=(2,), unit="px", doc="principal point")
+    earth_angle0 = Parameter(0.0, unit="rad", doc="inertial to Earth-fixed x axis at t = 0")
+    rotation_rate = Parameter(
+        EARTH.rotation_rate, unit="rad/s", doc="Earth rotation, as the filter knows it"
+    )
+    least_sigma = Parameter(
+        0.05, unit="px", positive=True, doc="of a vertex, where the contour claims less"
+    )
+
+    contour = MessageInput(**CONTOUR, doc="outline in the frame")
+    look = MessageInput(fields=LOOK, doc="which lake it is of, and how well it is seen")
+    prior = BundleInput(ORBIT_ESTIMATE, doc="estimate before the fix of this instant")
+    vertices = SharedInput(**CORNERS, doc="of the rings of all lakes")
+    starts = SharedInput(**STARTS, doc="of rings in the vertices")
+    center = SharedInput(**CENTERS, doc="of each lake")
+
+    fix = MessageOutput(fields=SHORE_FIX, doc="weighted sums of the shore's pixels")
+    reason = Output(
+        doc="of the last look: index into terrafix.models.filters.shore.SHORE_REASONS, 0 for a fix"
+    )
+
+    def _initialize_impl(self) -> None:
+        self.reason = np.nan
+        longest = int(np.diff(self.starts[: len(self.center) + 1]).max())
+        if longest > SHORE_VERTICES:
+            raise ConfigurationError(
+                f"'{self.name}' matches outlines of {SHORE_VERTICES} vertices at most; its catalog "
+                f"has one of {longest}\n  select smaller lakes, or a coarser source"
+            )
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        fresh = self.contour.fresh & self.look.fresh & self.environment.active
+        if not fresh.any():
+            return
+        n = self.n_members
+        y, present = np.zeros((n, ELEMENTS)), np.zeros((n, ELEMENTS))
+        W = np.zeros((n, ELEMENTS, SHORE_VERTICES, 2))
+        good = np.zeros(n, np.bool_)
+        for m in map(int, np.flatnonzero(fresh)):
+            found = self._match(m, int(self.look.lake[m]))
+            if isinstance(found, str):
+                self.reason[m] = SHORE_REASONS.index(found)
+                continue
+            y[m], present[m] = found.value, found.told
+            W[m, :, : found.of_vertices.shape[1]] = found.of_vertices
+            self.reason[m], good[m] = 0, True
+        self.fix.publish(
+            self.look.t,
+            valid=good,
+            y=y,
+            lake=self.look.lake[:, None],
+            weights=W.reshape(n, -1),
+            R=np.tile(np.eye(ELEMENTS), (n, 1, 1)),
+            present=present,
+        )
+
+    def _match(self, m: int, lake: int) -> Weights | str:
+        begin, end = self.starts[lake : lake + 2]
+        contour = self.contour.value[m, : self.contour.count[m]]
+        inside = ((contour > -0.5) & (contour < self.size[m] - 0.5)).all(axis=1)
+        sigma = max(float(self.look.sigma[m]), float(self.least_sigma[m]))
+        given = {n: getattr(self, n)[m : m + 1] for n in CAMERA} | {"t": self.look.t[m : m + 1]}
+        return match_shore(
+            np.concatenate([self.prior.r[m], self.prior.v[m]]),
+            self.prior.P[m],
+            given,
+            self.vertices[begin:end],
+            self.center[lake],
+            Shore(contour, inside & np.roll(inside, -1), sigma),
+        )
