@@ -191,6 +191,16 @@ def test_on_a_turntable_the_lever_arm_feels_the_centripetal_force():
     np.testing.assert_allclose(felt, [[-4 * 0.8, 4 * 0.3, 0.0]] * 5, rtol=1e-12, atol=1e-13)
 
 
+def test_gyroscopes_feel_the_force_where_they_are():
+    """At 1 m from the axis and 2 rad/s: 4 m/s^2 inward, times 0.01, on the rate about x."""
+    matrix = np.zeros((3, 3))
+    matrix[0, 0] = 0.01
+    _, rate, _ = one(
+        0 * FORCE, np.array([0, 0, 2.0]), lever_arm_b=[1, 0, 0], gyro_g_sensitivity=matrix
+    )
+    np.testing.assert_allclose(rate, [-0.04, 0, 2.0], rtol=1e-12)
+
+
 def test_in_a_spin_up_the_lever_arm_gains_the_speed_of_its_place():
     """The tangential part sums to (change of rate) x arm; at linear rates each step is exact."""
     alpha = np.array([0.5, -0.4, 3.0])
