@@ -50,7 +50,7 @@ class Imu(NoisyComponent):
     accel_bias_time = _time(3600.0, "correlation (gauss-markov, both)")
     accel_bias_instability = _sigma("m/s^2", "floor of the Allan deviation (0.664 B)")
     accel_bias_instability_time = _time(100.0, "around twice of it the floor is flat")
-    accel_scale_factor = Parameter([0.0] * 3, shape=(3,), doc="scale factor error")
+    accel_scale_factor = Parameter([0.0] * 3, shape=(3,), doc="scale factor error, fixed")
     accel_scale_factor_sigma = _sigma("1", "scale factor error drawn at the start")
     accel_nonlinearity = Parameter([0.0] * 3, shape=(3,), doc="scale factor error at full range")
     accel_quadratic = Parameter([0.0] * 3, shape=(3,), unit="s^2/m", doc="K2, per m/s^2")
@@ -67,7 +67,7 @@ class Imu(NoisyComponent):
     gyro_bias_time = _time(3600.0, "correlation (gauss-markov, both)")
     gyro_bias_instability = _sigma("rad/s", "floor of the Allan deviation (0.664 B)")
     gyro_bias_instability_time = _time(100.0, "around twice of it the floor is flat")
-    gyro_scale_factor = Parameter([0.0] * 3, shape=(3,), doc="scale factor error")
+    gyro_scale_factor = Parameter([0.0] * 3, shape=(3,), doc="scale factor error, fixed")
     gyro_scale_factor_sigma = _sigma("1", "scale factor error drawn at the start")
     gyro_nonlinearity = Parameter([0.0] * 3, shape=(3,), doc="scale factor error at full range")
     gyro_misalignment = Parameter(

@@ -55,7 +55,7 @@ A parameter of zero leaves its term out; no term is divided by it.
 References
 ----------
 .. [1] IEEE Std 952-1997, annexes B and C (models and Allan variances of gyroscopes).
-.. [2] IEEE Std 1293-1998, annex K and section 5.3 (model equation of accelerometers: K2).
+.. [2] IEEE Std 1293-1998 (model equation of accelerometers: K2).
 .. [3] IEEE Std 1559-2009 (terms of inertial systems).
 """
 

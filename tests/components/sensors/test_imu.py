@@ -100,7 +100,7 @@ def allan(increments, times):
 
 
 def assert_allan(increments, times, expected):
-    """Relative sigma 1 / sqrt(2 (K - 1)) with K clusters in each series (IEEE 952, C.1); 5 sigma.
+    """Within 5 sigma: 1 / sqrt(2 (K - 1)) for K clusters in a series (IEEE Std 952, annex C).
 
     Overlapping clusters only add to what is known.
     """
@@ -112,7 +112,7 @@ def assert_allan(increments, times, expected):
 
 
 def markov(times, sigma, tau):
-    """Allan deviation of a Gauss-Markov process (IEEE Std 952, equation C.20)."""
+    """Allan deviation of a Gauss-Markov process (IEEE Std 952, annex C)."""
     x = np.asarray(times) / tau
     return sigma * np.sqrt(2 / x * (1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x)))
 

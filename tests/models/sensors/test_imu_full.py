@@ -233,7 +233,7 @@ def test_the_centripetal_part_is_of_second_order():
 
 
 def markov_variance(time, tau):
-    """Allan variance of a Gauss-Markov process of sigma one (IEEE Std 952, equation C.20)."""
+    """Allan variance of a Gauss-Markov process of sigma one (IEEE Std 952, annex C)."""
     x = time / tau
     return 2 / x * (1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x))
 
