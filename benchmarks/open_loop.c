@@ -43,8 +43,8 @@ struct parameters {
     double attitude_rotation_rate;                                      /* attitude */
     double misalignment[3], misalignment_sigma0, misalignment_walk;     /* antenna */
     double attitude_noise_sigma, attitude_bias_sigma;                   /* ads */
-    double velocity_random_walk, accel_bias_sigma0, accel_bias_walk;    /* imu */
-    double angle_random_walk, gyro_bias_sigma0, gyro_bias_walk, gyro_scale_factor;
+    double velocity_random_walk[3], accel_bias_sigma0[3], accel_bias_walk[3]; /* imu */
+    double angle_random_walk[3], gyro_bias_sigma0[3], gyro_bias_walk[3], gyro_scale_factor[3];
     double sar_look, sar_squint, range_sigma, speed_sigma;              /* sar */
     double geolocation_sigma[3], geolocation_bias[3], ellipsoid_radius, flattening;
     double position_sigma[3], velocity_sigma[3];                        /* last_known */
@@ -305,12 +305,12 @@ static inline void sense(struct member *m, const struct shared *s, const struct 
     small_rotation(theta, error);
     product(error, m->q_be, m->measured_q_be);
     for (int i = 0; i < 3; i++) {
-        m->accel_bias[i] += p->accel_bias_walk * s->root_dt * n->accel_bias[i];
-        m->gyro_bias[i] += p->gyro_bias_walk * s->root_dt * n->gyro_bias[i];
+        m->accel_bias[i] += p->accel_bias_walk[i] * s->root_dt * n->accel_bias[i];
+        m->gyro_bias[i] += p->gyro_bias_walk[i] * s->root_dt * n->gyro_bias[i];
         m->delta_v[i] = m->accel_bias[i] * p->dt
-                        + p->velocity_random_walk * s->root_dt * n->accel_white[i];
-        m->delta_theta[i] = (1 + p->gyro_scale_factor) * m->turned[i] + m->gyro_bias[i] * p->dt
-                            + p->angle_random_walk * s->root_dt * n->gyro_white[i];
+                        + p->velocity_random_walk[i] * s->root_dt * n->accel_white[i];
+        m->delta_theta[i] = (1 + p->gyro_scale_factor[i]) * m->turned[i] + m->gyro_bias[i] * p->dt
+                            + p->angle_random_walk[i] * s->root_dt * n->gyro_white[i];
     }
 }
 
@@ -728,8 +728,8 @@ static void start(struct member *members, const uint32_t *identity, int64_t coun
         for (int i = 0; i < 3; i++) {
             theta[i] = p->misalignment[i] + p->misalignment_sigma0 * misaligned[3 * j + i];
             m->attitude_bias[i] = p->attitude_bias_sigma * attitude[3 * j + i];
-            m->accel_bias[i] = p->accel_bias_sigma0 * accel[3 * j + i];
-            m->gyro_bias[i] = p->gyro_bias_sigma0 * gyro[3 * j + i];
+            m->accel_bias[i] = p->accel_bias_sigma0[i] * accel[3 * j + i];
+            m->gyro_bias[i] = p->gyro_bias_sigma0[i] * gyro[3 * j + i];
             m->r[i] = m->r_e[i] + p->position_sigma[i] * known[6 * j + i];
             m->v[i] = m->v_e[i] + p->velocity_sigma[i] * known[6 * j + 3 + i];
             m->P_rr[i][i] = p->position_sigma[i] * p->position_sigma[i];

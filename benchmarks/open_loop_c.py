@@ -59,6 +59,7 @@ STRUCTURE = {
     "orbit.drag": False,
     "attitude.velocity": "earth-fixed",
     "imu.bias": "walk",
+    "imu.grade": "simple",
     "sar.boresight": "true",
     "sar.in_track": "speed",
     "predict.gravity": "j2",

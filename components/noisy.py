@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from terrafix.cosim.declare.parameters import Parameter
@@ -26,14 +27,23 @@ class NoisyComponent(SymbolicComponent):
         whole: Any = self.whole_model
         if self.lent is None or self.lent.quiet:
             return whole
-        zero = frozenset(
+        return self.model_without(
             n
             for n, s in self.settings().items()
             if isinstance(s, Parameter)
-            and s.minimum == 0.0
+            and self.vanishes(s)
             and n in whole.parameters
             and not self.parameter_values[n].any()
         )
+
+    def vanishes(self, parameter: Parameter) -> bool:
+        """Whether a parameter leaves the model where it is zero for every member: a sigma does."""
+        return parameter.minimum == 0.0
+
+    def model_without(self, parameters: Iterable[str]) -> Model:
+        """The whole model with parameters of value zero, and without the noise they cancel."""
+        whole: Any = self.whole_model
+        zero = frozenset(parameters)
         if self._silent is None or self._silent[0] is not whole:
             self._silent = (whole, {})
         known = self._silent[1]

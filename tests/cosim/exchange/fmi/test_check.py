@@ -31,6 +31,13 @@ def test_exponentials_do_not_ask_for_a_new_c_library(exported):
     assert report.findings == []
 
 
+def test_a_sensor_with_every_error_of_a_data_sheet_has_no_finding(exported):
+    """Draws at the start, full ranges, jitter and a lever arm; without the stairs of quanta."""
+    settings = {"grade": "STIM300", "time_jitter": "1 us", "lever_arm_b": "[1, 0, 0] m"}
+    chosen = tuple((f"imu.{name}", value) for name, value in settings.items())
+    assert check_fmu(exported("imu", 3, chosen)).findings == []
+
+
 def found(spring, tmp_path, fmi=3, **changes):
     """Checks that complain of a spring with something wrong, and what they say."""
     file = broken(spring(fmi), tmp_path / "broken.fmu", **changes)
