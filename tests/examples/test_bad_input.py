@@ -8,6 +8,7 @@ time by what follows from it.
 import functools
 import json
 import re
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +28,9 @@ from terrafix.cosim.files.readers import read_system
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 OPEN_LOOP = (EXAMPLES / "spacecraft_sar_open_loop.toml").read_text()
+
+PROJECT = tomllib.loads((EXAMPLES.parent / "pyproject.toml").read_text())["project"]
+TYPES = ", ".join(sorted(PROJECT["entry-points"]["terrafix.components"]))
 
 JARGON = re.compile(
     r"Traceback|NoneType|None\b|KeyError|TypeError|AttributeError|object has no|\[Errno|<class|"
@@ -76,15 +80,7 @@ SYSTEM_MISTAKES = {
         'type = "imu"',
         "type = 3",
         "ConfigurationError: 'imu' has the type 3, which is no name\n"
-        "  component types: antenna_mount, attitude_sensor, contour_moments, earlier_pass, fmu, "
-        "fmu_loop, image_album, image_former, image_matcher, image_moments, imu, lake_camera, "
-        "lake_catalog, lake_correct, lake_correct_considered, lake_imager, last_known_orbit, "
-        "last_known_state, linear, lvlh_attitude, mekf_correct, mekf_predict, "
-        "mekf_predict_smoothed, navigation_evaluation, orbit, orbit_evaluation, "
-        "orbit_evaluation_considered, orbit_evaluation_shore, orbit_predict, "
-        "orbit_predict_considered, recorded_attitude, recorded_echo, recorded_imu, "
-        "recorded_orbit, recorded_reference, reference_file, scene_echo, "
-        "shore_correct, shore_matcher, synthetic_sar_fix, terrain",
+        f"  component types: {TYPES}",
     ),
     "table that is misspelled": edit(
         "[component.orbit]",
