@@ -25,6 +25,11 @@ TEN_HZ = tuple(
     (f"{name}.period", "0.1 s")
     for name in ("orbit", "camera", "moments", "predict", "correct", "evaluation")
 )
+CENTERED = (
+    ("orbit.r0_i", "[3474049.999, -3751352.019, 4675038.16] m"),
+    ("orbit.v0_i", "[5554.061734, 5165.940371, 17.984525] m/s"),
+)
+"""The orbit of leo_lake."""
 CASES = {"T1": (15e3, 1.0), "T2": (15e3, 100.0), "T3": (70e3, 100.0)}
 VARIANTS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
     "10 Hz": ("T3", TEN_HZ),
@@ -95,6 +100,12 @@ def main() -> None:
     for case in CASES:
         print(f"leo_lake, {case}: all vertices could tell {bound(case):.4f} km")
         fly("leo_lake.toml", case, options.members)
+    for case in CASES:
+        print(f"leo_lake_shore, {case}: part of the lake; then the pass of leo_lake, all of it")
+        fly("leo_lake_shore.toml", case, options.few)
+        fly("leo_lake_shore.toml", case, options.few, CENTERED)
+    print("leo_lake_shore, T2, 0.5 px")
+    fly("leo_lake_shore.toml", "T2", options.few, (*CENTERED, ("camera.vertex_sigma", "0.5 px")))
     for name, (case, settings) in VARIANTS.items():
         print(f"leo_lake, {case}, {name}")
         fly("leo_lake.toml", case, options.few, settings)
