@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from terrafix.components.filters.family import transition_ports
 from terrafix.models.core.batch import over_members
+from terrafix.models.filters.ensembles import ensemble_observation, staged_model
 from terrafix.models.filters.error_state import (
     AGE,
     Carried,
@@ -23,6 +24,7 @@ from terrafix.models.filters.lake import COASTING, ORBIT, orbit_process
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.models import correct_model, predict_model
 from terrafix.models.geometry.earth import EARTH
+from terrafix.models.geometry.quaternion import rotation_matrix, rotation_matrix_array
 from terrafix.models.motion.gravity import j2_acceleration
 
 STRAIGHT = ErrorState(*ORBIT)
@@ -165,6 +167,53 @@ def test_an_estimate_ages_until_it_is_corrected():
     for gate, expected in ((np.inf, 0.0), (1e-9, 5000.0)):
         found = corrected(**told, fix_fresh=1.0, gate=np.full(3, gate))
         assert float(found["age"]) == expected
+
+
+TURNING = ErrorState(*ORBIT, rotation("q", side="left"), carried=COASTING)
+
+
+def looking(x, _):
+    """Position, in axes that are turned by q: in hundreds of kilometers."""
+    return ca.mtimes(rotation_matrix(x["q"]), x["r"]) / 1e5
+
+
+def evaluated(model, given):
+    """Posterior of a correction, and of what is not given zero."""
+    symbols = {**model.inputs, **model.parameters, **model.states, "time": model.time}
+    names = [name.replace(".", "_") for name in symbols]
+    outputs = [model.outputs[f"estimate.{name}"] for name in ("r", "v", "q", "P")]
+    f = ca.Function("f", list(symbols.values()), outputs, names, ["r", "v", "q", "P"])
+    return f(**{name.replace(".", "_"): value for name, value in given.items()})
+
+
+@pytest.mark.parametrize("update", ["ekf", "iterated", "unscented"])
+def test_an_ensemble_is_corrected_as_by_an_expression(update):
+    """Whose derivative is by the error about each point: it is turned to that about the prior."""
+    elements = {"x": "m", "y": "m", "z": "m"}
+    P = np.diag(np.repeat([1e10, 1e2, 0.04], 3))
+    P[0, 4] = P[4, 0] = 5e5
+    given = {"prior.r": R, "prior.v": V, "prior.q": np.array([0.5, -0.5, 0.1, 0.7]), "prior.P": P}
+    given["prior.q"] = given["prior.q"] / np.linalg.norm(given["prior.q"])
+    y = rotation_matrix_array(given["prior.q"]) @ R / 1e5 + [0.5, -1.0, 0.7]
+    given |= {f"prior.{AGE}": np.array([5000.0]), "fix.y": y}
+    given |= {"fix.R": 1e-4 * np.eye(3), "fix.present": np.ones(3), "fix.fresh": np.ones(1)}
+    given["gate"] = np.full(3, np.inf)
+    expected = evaluated(
+        correct_model("whole", TURNING, Observation(looking, elements), update), given
+    )
+    seen = ensemble_observation(TURNING, looking, elements)
+    model, stages = staged_model("staged", TURNING, seen, update)
+    for stage in stages:
+        shapes = stage.arguments.items()
+        points = stage.points(*(given.get(name, np.zeros(shape)) for name, shape in shapes))
+        values = {b.name: np.asarray(v) for b, v in zip(TURNING, points, strict=True)}
+        y, H = seen.predict(values, {}), seen.derivative(values, {})
+        for i, number in enumerate(stage.numbers):
+            given |= {f"answer.y{number}": y[i], f"answer.H{number}": H[i]}
+    known = {n: v for n, v in given.items() if n in model.inputs or not n.startswith("answer")}
+    found = evaluated(model, known)
+    for name, scale in (("r", 1e5), ("v", 1e1), ("q", 1.0), ("P", 1e10)):
+        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-8 * scale)
 
 
 @pytest.mark.parametrize(
