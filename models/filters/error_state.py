@@ -70,8 +70,6 @@ XYZ = ("x", "y", "z")
 AGE = "age"
 """Name of the time since the last correction, where errors are carried along."""
 
-_OWN = {"P", "t", AGE}
-
 
 @dataclass(frozen=True)
 class Block:
@@ -271,7 +269,8 @@ class ErrorState:
         if not names:
             raise ValueError("an error state has one block or more")
         names += [f"t_{instant}" for instant in self.instants]
-        twice = sorted({name for name in names if names.count(name) > 1} | _OWN & set(names))
+        own = {"P", "t", AGE} if carried else {"P", "t"}
+        twice = sorted({name for name in names if names.count(name) > 1} | own & set(names))
         if twice:
             raise ValueError(
                 f"two things of an error state are called '{twice[0]}'; blocks have names of their "
