@@ -114,7 +114,12 @@ def orbit(case: str, track: str, members: int, *, straight: bool = False) -> Non
     gap = (at[last + 1] - at[last]) / 2
     nees = data["evaluation.nees"].values
     print(f"  {lakes} lakes, {100 * fixed.mean():.2f} % of the time in view, {gap:.0f} s without")
-    for when, k in (("before", at[last]), ("end of gap", first[0] - 1), ("after", first[-1])):
+    for when, k in (
+        ("before", at[last]),
+        ("end of gap", first[0] - 1),
+        ("after", first[-1]),
+        ("end", len(nees) - 1),
+    ):
         error = np.linalg.norm(data["evaluation.position_error"].values[k], axis=1) / 1e3
         sigma = np.linalg.norm(data["evaluation.position_sigma"].values[k], axis=1) / 1e3
         speed = np.linalg.norm(data["evaluation.velocity_sigma"].values[k], axis=1)
