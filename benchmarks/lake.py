@@ -1,16 +1,22 @@
 """How well a satellite knows itself by a lake: errors, consistency, time, and what a contour tells.
 
-    python benchmarks/lake.py [--members 200] [--few 50]
+    python benchmarks/lake.py [--members 200] [--few 50] [--orbit]
 
 Errors of the position after seven seconds, by case and by what is changed, beside the filter's own
 sigma and NEES; and the bound of Cramer and Rao: what all vertices would tell of position and
 velocity if each were known by its number, over the same frames and from the same prior. Needs the
 outline of Seneca Lake (TERRAFIX_DATA).
+
+With --orbit, only a whole orbit over the world's lakes (`terrafix[world]`): what is known before
+the longest way without a lake, at its end and after the next lake, with errors that are carried
+along the orbit, and with errors that add up in Cartesian axes.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -18,6 +24,10 @@ from typing import Any
 import numpy as np
 
 import terrafix as tf
+from terrafix.components.filters.lake import LakeCorrect, OrbitPredict
+from terrafix.components.judges.evaluation import OrbitEvaluation
+from terrafix.models.filters.error_state import ErrorState
+from terrafix.models.filters.lake import ORBIT, lake_observation
 from terrafix.models.sensors.camera import CAMERA, Seen
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -30,6 +40,8 @@ CENTERED = (
     ("orbit.v0_i", "[5554.061734, 5165.940371, 17.984525] m/s"),
 )
 """The orbit of leo_lake."""
+STRAIGHT = ErrorState(*ORBIT)
+"""Position and velocity, whose errors add up."""
 CASES = {"T1": (15e3, 1.0), "T2": (15e3, 100.0), "T3": (70e3, 100.0)}
 VARIANTS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
     "10 Hz": ("T3", TEN_HZ),
@@ -64,6 +76,73 @@ def fly(
         )
 
 
+class StraightPredict(OrbitPredict):
+    """An orbit whose errors add up in Cartesian axes."""
+
+    error_state = STRAIGHT
+
+
+class StraightCorrect(LakeCorrect):
+    """Its correction."""
+
+    error_state, observation = STRAIGHT, lake_observation(STRAIGHT)
+
+
+class StraightEvaluation(OrbitEvaluation):
+    """Its judge."""
+
+    error_state, observation = STRAIGHT, lake_observation(STRAIGHT)
+
+
+def orbit(case: str, track: str, members: int, *, straight: bool = False) -> None:
+    """Fly an orbit, and print a line for each instant of its longest way without a lake."""
+    with tempfile.TemporaryDirectory() as folder:
+        text = (EXAMPLES / "leo_lakes_orbit.toml").read_text()
+        for kind in ("predict", "correct", "evaluation") if straight else ():
+            name = "lake_correct" if kind == "correct" else f"orbit_{kind}"
+            text = text.replace(f'"{name}"', f'"lake:Straight{kind.title()}"')
+        file = Path(folder) / "leo_lakes_orbit.toml"
+        file.write_text(text)
+        system = tf.read_system(file, [("case", case), ("track", track)])
+        looks = system.find("camera")["look"]
+        system.record("looks", [looks], period="1/2")
+        began = time.process_time()
+        data = tf.simulate(system, members=members).dataset
+        took = time.process_time() - began
+    fixed = np.isfinite(data["evaluation.accepted"].values).any(axis=1)
+    whole = data["camera.look.whole"].values > 0.5
+    lakes = len(np.unique(data["camera.look.lake"].values[whole]))
+    at = np.flatnonzero(fixed)
+    last = int(np.diff(at).argmax())  # of the fixes before the longest way
+    later = at[last + 1 :]
+    first = later[: np.flatnonzero(np.diff(later, append=10**9) > _PASS)[0] + 1]
+    gap = (at[last + 1] - at[last]) / 2
+    nees = data["evaluation.nees"].values
+    print(f"  {lakes} lakes, {100 * fixed.mean():.2f} % of the time in view, {gap:.0f} s without")
+    for when, k in (
+        ("before", at[last]),
+        ("end of gap", first[0] - 1),
+        ("after", first[-1]),
+        ("end", len(nees) - 1),
+    ):
+        error = np.linalg.norm(data["evaluation.position_error"].values[k], axis=1) / 1e3
+        sigma = np.linalg.norm(data["evaluation.position_sigma"].values[k], axis=1) / 1e3
+        speed = np.linalg.norm(data["evaluation.velocity_sigma"].values[k], axis=1)
+        print(
+            f"    {when:10s} t {k / 2:6.1f} s  median {np.nanmedian(error):8.3f}  90 % "
+            f"{np.nanpercentile(error, 90):8.3f} km  sigma {np.nanmedian(sigma):8.3f} km "
+            f"{np.nanmedian(speed):7.3f} m/s  NEES {np.nanmean(nees[k]):9.3g}"
+        )
+    lost = ~(nees[-1] < _LOST)
+    print(f"    lost at the end: {lost.sum()} of {members}; {took / members:.2f} s CPU/member")
+
+
+_PASS = 20
+"""Ticks without a fix that end a pass over lakes."""
+_LOST = 30.0
+"""NEES (3) that one in 700,000 exceeds by chance."""
+
+
 def bound(case: str, sigma: float = 0.25) -> float:
     """Root of the trace of the smallest covariance of the position at the end [km]."""
     system = tf.read_system(EXAMPLES / "leo_lake.toml", [("case", case)])
@@ -96,7 +175,15 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--members", type=int, default=200)
     parser.add_argument("--few", type=int, default=50)
+    parser.add_argument("--orbit", action="store_true")
     options = parser.parse_args()
+    if options.orbit:
+        for track, case, straight in itertools.product(
+            ("north", "east"), ("T1", "T3"), (False, True)
+        ):
+            print(f"leo_lakes_orbit, {track}, {case}, {'straight' if straight else 'carried'}")
+            orbit(case, track, options.few, straight=straight)
+        return
     for case in CASES:
         print(f"leo_lake, {case}: all vertices could tell {bound(case):.4f} km")
         fly("leo_lake.toml", case, options.members)

@@ -38,7 +38,7 @@ from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.fields import Field, Unit
 from terrafix.models.core.model import Model
 from terrafix.models.filters.consistency import gate_thresholds
-from terrafix.models.filters.error_state import Block, ErrorState
+from terrafix.models.filters.error_state import AGE, Block, ErrorState
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.models import correct_model, predict_model
 from terrafix.models.filters.process import Process
@@ -66,7 +66,10 @@ def estimate_fields(state: ErrorState) -> dict[str, Field]:
     P = Field(
         (state.size, state.size), "1", doc="covariance of the error, in units of its elements"
     )
-    times = {f"t_{i}": Field((1,), "s", doc="of its clones") for i in state.instants}
+    times = {
+        time: Field((1,), "s", doc="since its correction" if time == AGE else "of its clones")
+        for time in state.times
+    }
     return {block.name: value_field(block) for block in state} | times | {"P": P}
 
 
@@ -181,8 +184,13 @@ def transition_ports(state: ErrorState) -> tuple[Output, Output]:
     Raises
     ------
     ValueError
-        If a block is considered, which cannot be smoothed.
+        If a block is considered, or errors are carried, which cannot be smoothed.
     """
+    if state.carried:
+        raise ValueError(
+            f"errors of {', '.join(state.carried.blocks)} are carried along from correction to "
+            "correction, and a smoother's are not\n  leave `smoothed` out, or `carried`"
+        )
     kept = [block.name for block in state if block.considered]
     if kept:
         raise ValueError(

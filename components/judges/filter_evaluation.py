@@ -108,7 +108,12 @@ class FilterEvaluation(Evaluation):
         P = estimate.P[:, own][:, :, own]
         names = [block.name for block in state]
         truth = [self.port_views[name] for name in names]
-        error = state.difference_of_arrays(*(getattr(estimate, name) for name in names), *truth)
+        own_values = [getattr(estimate, name) for name in names]
+        if state.carried:
+            # P is about the estimate, and so are the errors
+            error = -state.difference_of_arrays(*truth, *own_values, estimate.age)
+        else:
+            error = state.difference_of_arrays(*own_values, *truth)
         variance = np.diagonal(P, axis1=1, axis2=2)
         sigma = np.sqrt(np.where(variance > 0.0, variance, np.nan))
         for block, place in state.places.items():

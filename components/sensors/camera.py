@@ -95,8 +95,11 @@ class LakeCamera(Component):
         n, longest = self.n_members, self._longest
         vertices = np.full((n, MOST_VERTICES, 2), np.nan)
         count, lake, whole = np.zeros(n, dtype=np.int64), np.zeros(n), np.zeros(n)
-        noise = self.normals("vertices", 2 * longest).reshape(n, longest, 2)
-        for lakes in self._candidates(t).T:  # nearest first; a whole outline before any other
+        candidates = self._candidates(t)
+        noise = np.empty((0, 0, 2))  # drawn only where there is something to see
+        if (candidates >= 0).any():
+            noise = self.normals("vertices", 2 * longest).reshape(n, longest, 2)
+        for lakes in candidates.T:  # nearest first; a whole outline before any other
             for number in np.unique(lakes[lakes >= 0]):
                 rows = np.flatnonzero((lakes == number) & (whole < 0.5))
                 if not rows.size:  # all that could see it have a whole one already

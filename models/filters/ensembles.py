@@ -183,7 +183,8 @@ class _Traced(Observation):
         def derivative(error: Any) -> Any:
             k = place(error)
             self.wanted.add(k)
-            return self.asked[k].H
+            H = self.asked[k].H  # by the error about the point itself
+            return ca.mtimes(H, state.recentering(error, prior)) if state.is_curved else H
 
         return Measurement(
             message["y"],

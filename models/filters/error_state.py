@@ -17,6 +17,19 @@ c`, the error is :math:`e' = (\hat x \oplus e) \ominus \hat x'`, and its covaria
 :math:`J P J^T` with :math:`J = \partial e' / \partial e` at :math:`e = c`: the identity for
 vectors, not for rotations (`ErrorState.recentering`).
 
+Errors of several blocks may be those of an earlier instant, carried along by a known motion
+:math:`K` (`Carried`): after the age :math:`\tau`, the time since the last correction,
+
+.. math::
+    x = K_\tau\bigl(K_{-\tau}(\hat x) + K'_{-\tau}\, e\bigr), \qquad
+    e = K'_\tau \bigl(K_{-\tau}(x) - K_{-\tau}(\hat x)\bigr),
+
+with the derivatives :math:`K'` about the estimate, so that :math:`x = \hat x + e` to first order: a
+covariance, its transition and the derivative of a measurement at the estimate are those of a
+vector. What was normally distributed when the estimate was corrected stays so in :math:`e` as long
+as nature moves by :math:`K`, however far errors grow and however they bend; on correction the age
+is zero again.
+
 References
 ----------
 .. [1] C. Hertzberg, R. Wagner, U. Frese, L. Schroeder, "Integrating generic sensor fusion
@@ -26,6 +39,7 @@ References
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -52,6 +66,9 @@ SIDES = ("left", "right")
 """Of a rotation's error: in the axes it leads to, or in those it comes from."""
 
 XYZ = ("x", "y", "z")
+
+AGE = "age"
+"""Name of the time since the last correction, where errors are carried along."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +197,44 @@ def clone(block: Block, instant: str) -> Block:
     return replace(block, name=f"{block.name}_at_{instant}", clone_of=block.name, instant=instant)
 
 
+@dataclass(frozen=True)
+class Carried:
+    """Vectors whose errors are those at the last correction, carried along by a motion.
+
+    Parameters
+    ----------
+    blocks : tuple of str
+    motion : callable
+        Of their values, one below the other (n, 1), and a time [s] of either sign: their values
+        after that time. It is undone by the same time backward, and near that of the process: what
+        the two differ by bends what is carried.
+    derivative : callable
+        Likewise, the derivative (n, n) of the values after by those before.
+    """
+
+    blocks: tuple[str, ...]
+    motion: Callable[[Any, Any], Any]
+    derivative: Callable[[Any, Any], Any]
+
+    def plus(self, values: Any, error: Any, age: Any) -> Any:
+        """Values (n, 1) that are off by an error (n, 1)."""
+        return self.motion(self._off(values, error, age), age)
+
+    def minus(self, values: Any, others: Any, age: Any) -> Any:
+        """The error (n, 1) that takes others to values, about the others."""
+        then = self.motion(others, -age)
+        return ca.mtimes(self.derivative(then, age), self.motion(values, -age) - then)
+
+    def slope(self, values: Any, error: Any, age: Any) -> Any:
+        """Derivative (n, n) of `plus` by the error."""
+        off = self._off(values, error, age)
+        return ca.mtimes(self.derivative(off, age), self.derivative(values, -age))
+
+    def _off(self, values: Any, error: Any, age: Any) -> Any:
+        """Values at the last correction, off by an error that has been carried since."""
+        return self.motion(values, -age) + ca.mtimes(self.derivative(values, -age), error)
+
+
 class _Values(dict[str, Any]):
     """Values by block; a name that is none is answered with those that are."""
 
@@ -194,26 +249,39 @@ class ErrorState:
     Parameters
     ----------
     blocks : tuple of Block
+    carried : Carried, optional
+        Blocks whose errors are those at the last correction, carried along. An estimate then has
+        an age, the time since [s]; values without one are new.
 
     Raises
     ------
     ValueError
-        If there is none, names clash, or a clone is of no block.
+        If there is none, names clash, a clone is of no block, or what is carried is no vector.
     """
 
     blocks: tuple[Block, ...]
+    carried: Carried | None = None
 
-    def __init__(self, *blocks: Block) -> None:
+    def __init__(self, *blocks: Block, carried: Carried | None = None) -> None:
         object.__setattr__(self, "blocks", tuple(blocks))
+        object.__setattr__(self, "carried", carried)
         names = [block.name for block in blocks]
         if not names:
             raise ValueError("an error state has one block or more")
         names += [f"t_{instant}" for instant in self.instants]
-        twice = sorted({name for name in names if names.count(name) > 1} | {"P", "t"} & set(names))
+        own = {"P", "t", AGE} if carried else {"P", "t"}
+        twice = sorted({name for name in names if names.count(name) > 1} | own & set(names))
         if twice:
             raise ValueError(
                 f"two things of an error state are called '{twice[0]}'; blocks have names of their "
-                "own, and P is the covariance, t the time"
+                "own, and P is the covariance, t the time, age that since the last correction"
+            )
+        vectors = [b.name for b in blocks if not b.is_rotation]
+        wrong = [name for name in (carried.blocks if carried else ()) if name not in vectors]
+        if wrong:
+            raise ValueError(
+                f"'{wrong[0]}' is carried, and no vector of the error state; its vectors are "
+                f"{', '.join(vectors) or 'none'}"
             )
         for block in blocks:
             of = next((b for b in blocks if b.name == block.clone_of), None)
@@ -243,12 +311,19 @@ class ErrorState:
     @cached_property
     def present(self) -> ErrorState:
         """The blocks that are of now: without clones."""
-        return ErrorState(*(block for block in self.blocks if not block.clone_of))
+        now = (block for block in self.blocks if not block.clone_of)
+        return ErrorState(*now, carried=self.carried)
 
     @property
     def instants(self) -> tuple[str, ...]:
         """Names of the instants that clones are of."""
         return tuple(dict.fromkeys(b.instant for b in self.blocks if b.clone_of))
+
+    @property
+    def times(self) -> tuple[str, ...]:
+        """Names of the times that an estimate holds: of its clones, and its age."""
+        clones = tuple(f"t_{instant}" for instant in self.instants)
+        return (*clones, AGE) if self.carried else clones
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -264,7 +339,7 @@ class ErrorState:
     def shapes(self) -> dict[str, tuple[int, int]]:
         """Shapes of the fields of an estimate: values, the times of clones, the covariance P."""
         values = {block.name: (block.value_size, 1) for block in self.blocks}
-        times = {f"t_{instant}": (1, 1) for instant in self.instants}
+        times = dict.fromkeys(self.times, (1, 1))
         return values | times | {"P": (self.size, self.size)}
 
     def symbols(self, name: str) -> dict[str, Any]:
@@ -278,9 +353,27 @@ class ErrorState:
 
     def retract(self, values: Values, error: Any) -> dict[str, Any]:
         """Values that are off by an error (n, 1)."""
-        return _Values(
+        off = _Values(
             {b.name: b.plus(values[b.name], self.part(error, b.name)) for b in self.blocks}
         )
+        if self.carried and AGE in values:
+            moved = self.carried.plus(
+                self._along(values), error[self._carried_places, :], values[AGE]
+            )
+            ends = itertools.accumulate(values[n].shape[0] for n in self.carried.blocks)
+            off |= zip(self.carried.blocks, ca.vertsplit(moved, [0, *ends]), strict=True)
+        return off
+
+    def _along(self, values: Values) -> Any:
+        """Values of what is carried, one below the other."""
+        assert self.carried is not None
+        return ca.vertcat(*(values[name] for name in self.carried.blocks))
+
+    @cached_property
+    def _carried_places(self) -> list[int]:
+        """Elements of the error that are carried."""
+        names = self.carried.blocks if self.carried else ()
+        return [k for n in names for k in range(self.places[n].start, self.places[n].stop)]
 
     def normalized(self, values: Values) -> dict[str, Any]:
         """Values whose quaternions are of unit length, which they lose by and by to rounding."""
@@ -290,22 +383,30 @@ class ErrorState:
         }
 
     def difference(self, values: Values, others: Values) -> Any:
-        """The error (n, 1) that takes `others` to `values`."""
-        return ca.vertcat(*(b.minus(values[b.name], others[b.name]) for b in self.blocks))
+        """The error (n, 1) that takes `others` to `values`, of the others' age."""
+        error = ca.vertcat(*(b.minus(values[b.name], others[b.name]) for b in self.blocks))
+        if self.carried and AGE in others:
+            error[self._carried_places, :] = self.carried.minus(
+                self._along(values), self._along(others), others[AGE]
+            )
+        return error
 
     def flat_difference(self, *values: Any) -> Any:
-        """`difference` of the values of all blocks and then of the others', one by one."""
+        """`difference` of the values of all blocks and then of the others', one by one.
+
+        Last of all may come the others' age.
+        """
         names = [block.name for block in self.blocks]
-        one, other = values[: len(names)], values[len(names) :]
-        return self.difference(
-            dict(zip(names, one, strict=True)), dict(zip(names, other, strict=True))
-        )
+        n = len(names)
+        others = dict(zip((*names, AGE), values[n:], strict=False))
+        return self.difference(dict(zip(names, values[:n], strict=True)), others)
 
     @cached_property
     def difference_of_arrays(self) -> Callable[..., FloatArray]:
-        """`flat_difference` of arrays (..., size): errors (..., n)."""
+        """`flat_difference` of arrays (..., size): errors (..., n); with an age, if it has one."""
         shapes = [(block.value_size,) for block in self.blocks]
-        found = over_members(self.flat_difference, *shapes, *shapes)
+        ages = [(1,)] if self.carried else []
+        found = over_members(self.flat_difference, *shapes, *shapes, *ages)
 
         def difference(*values: FloatArray) -> FloatArray:
             errors: FloatArray = found(*values)
@@ -313,11 +414,17 @@ class ErrorState:
 
         return difference
 
-    def recentering(self, correction: Any) -> Any:
+    @property
+    def is_curved(self) -> bool:
+        """Whether errors about two estimates differ by more than a constant."""
+        return bool(self.carried) or any(block.is_rotation for block in self.blocks)
+
+    def recentering(self, correction: Any, prior: Values | None = None) -> Any:
         """Derivative (n, n) of the error about a corrected estimate by that about the prior.
 
         At the correction (n, 1) itself, where the first is zero. A rotation's is that of the
-        rotation vectors alone, and the same on either side but for its transpose.
+        rotation vectors alone, and the same on either side but for its transpose; of what is
+        carried the prior is needed, values that have an age.
         """
         parts = []
         for block in self.blocks:
@@ -332,13 +439,17 @@ class ErrorState:
                 else product(inverse(about), off)
             )
             parts.append(ca.substitute(ca.jacobian(turn, delta), delta, ca.SX.zeros(3)))
-        return ca.diagcat(*parts)
+        J = ca.diagcat(*parts)
+        if self.carried and prior is not None and AGE in prior:
+            own = self._carried_places  # about the corrected estimate, which is new: a sum
+            J[own, own] = self.carried.slope(self._along(prior), correction[own, :], prior[AGE])
+        return J
 
-    def recentered(self, P: Any, correction: Any) -> Any:
+    def recentered(self, P: Any, correction: Any, prior: Values | None = None) -> Any:
         """A covariance (n, n) about the corrected estimate, from that about the prior."""
-        if not any(block.is_rotation for block in self.blocks):
+        if not self.is_curved:
             return P
-        J = self.recentering(correction)
+        J = self.recentering(correction, prior)
         return mirrored(ca.mtimes(J, ca.mtimes(P, J.T)))
 
     def cloning(self, instant: str) -> Any:

@@ -30,24 +30,37 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.filters.ensembles import Arrays, EnsembleObservation
-from terrafix.models.filters.error_state import ErrorState, considered, vector
+from terrafix.models.filters.error_state import Carried, ErrorState, considered, vector
 from terrafix.models.filters.measurement import TIME
 from terrafix.models.filters.process import Process
+from terrafix.models.geometry.earth import EARTH
 from terrafix.models.images.polygons import moments
 from terrafix.models.motion.gravity import j2_acceleration
+from terrafix.models.motion.kepler import coasted, coasting
 from terrafix.models.sensors.camera import CAMERA, STATE_SIZES, Seen
 
-ORBIT = ErrorState(vector("r", unit="m", frame="i"), vector("v", unit="m/s", frame="i"))
+COASTING = Carried(
+    ("r", "v"),
+    lambda x, time: ca.vertcat(*coasted(x[:3], x[3:], time, EARTH.mu)),
+    lambda x, time: coasting(x[:3], x[3:], time, EARTH.mu),
+)
+"""Errors bend along an orbit: they are those at the last look, carried by two-body motion."""
+
+ORBIT = ErrorState(
+    vector("r", unit="m", frame="i"), vector("v", unit="m/s", frame="i"), carried=COASTING
+)
 """Position and velocity, inertial."""
 
 CONSIDERED = ErrorState(
     *ORBIT,
     considered(vector("attitude", unit="rad", frame="c")),
     considered(vector("scale", 1)),
+    carried=COASTING,
 )
 """The same, with what the camera and the catalog do not know."""
 

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import casadi as ca
 
 from terrafix.models.core.symmetric import mirrored
-from terrafix.models.filters.error_state import Block, ErrorState, Values
+from terrafix.models.filters.error_state import AGE, Block, ErrorState, Values
 from terrafix.models.filters.updates import Measurement, Update, nth
 
 REASONS = (
@@ -271,7 +271,9 @@ def corrected(
         ca.fabs(lateness) <= SAME_INSTANT, reason, REASONS.index("not of this instant")
     )
     accepted = reason == 0
-    P = state.recentered(outcome.P, outcome.correction) if recentered else outcome.P
+    P = state.recentered(outcome.P, outcome.correction, prior) if recentered else outcome.P
     posterior = {**state.normalized(state.retract(prior, outcome.correction)), "P": P}
+    if state.carried:
+        posterior[AGE] = ca.SX(0)
     values = {**prior, **{k: ca.if_else(accepted, posterior[k], prior[k]) for k in posterior}}
     return Correction(values, accepted, reason, dof, outcome)

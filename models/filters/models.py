@@ -20,7 +20,7 @@ import casadi as ca
 
 from terrafix.models.core.model import Model
 from terrafix.models.core.symmetric import mirrored, semidefinite_root
-from terrafix.models.filters.error_state import ErrorState
+from terrafix.models.filters.error_state import AGE, ErrorState
 from terrafix.models.filters.measurement import TIME, Observation, corrected
 from terrafix.models.filters.process import Process, propagate
 from terrafix.models.filters.robust import THRESHOLDS, robust_rule
@@ -109,6 +109,8 @@ def predict_model(
         phi = ca.if_else(mark > 0.5, ca.mtimes(state.cloning(instant), phi), phi)
     moved = propagate(state, process, begin, {**inputs, **parameters}, step, time)
     following = {**begin, **moved.values, "P": moved.covariance(begin["P"])}
+    if state.carried:
+        following[AGE] = begin[AGE] + step
     states = dict(own)
     outputs = {f"prior.{key}": symbol for key, symbol in own.items()}
     if smoothed:
@@ -187,7 +189,7 @@ def _start(
     for block in state:
         if block.clone_of:
             initial[block.name] = initial[block.clone_of]
-    never = {f"t_{instant}": ca.SX(NEVER) for instant in state.instants}
+    never = {time: ca.SX(0 if time == AGE else NEVER) for time in state.times}
     return start, {**initial, **never, "P": ca.densify(P)}
 
 

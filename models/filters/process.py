@@ -172,6 +172,7 @@ def propagate(
         If the process names a block that does not exist, twice, or its noise has another size.
     """
     _check(state, process)
+    values = {block.name: values[block.name] for block in state}
     end = _end(state, process, values, given, step, time)
     if process.transition is not None:
         phi = process.transition(values, end, given, step)

@@ -8,17 +8,29 @@ r"""Keplerian elements and Cartesian state of a two-body orbit.
 in the perifocal axes :math:`\hat p` (to perigee) and :math:`\hat q`, turned by the argument of
 perigee, inclination and right ascension of the ascending node.
 
+Motion over a time :math:`t` is Lagrange's :math:`r' = f r + g v`, :math:`v' = \dot f r + \dot g v`,
+with the difference :math:`\Delta` of eccentric anomalies from Kepler's equation between two places
+of an orbit,
+
+.. math::
+    n t = \Delta + \frac{r \cdot v}{\sqrt{\mu a}} (1 - \cos\Delta)
+        - \Bigl(1 - \frac{\lVert r \rVert}{a}\Bigr) \sin\Delta .
+
 References
 ----------
 .. [1] D. A. Vallado, "Fundamentals of Astrodynamics and Applications", 4th ed., algorithms
        9 and 10.
+.. [2] R. H. Battin, "An Introduction to the Mathematics and Methods of Astrodynamics", 1999,
+       sections 4.3 and 4.4.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import cos, sin, sqrt
+from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -122,6 +134,72 @@ def circular_orbit(
 ) -> tuple[FloatArray, FloatArray]:
     """Inertial state, two (3,), on a circular orbit at its ascending node on the x axis."""
     return KeplerianElements(radius, 0.0, inclination, 0.0, 0.0, 0.0).state(mu)
+
+
+ITERATIONS = 6
+"""Of Newton's method for Kepler's equation."""
+LARGEST = 50.0
+"""Semi-major axis over distance."""
+
+
+def coasted(r: Any, v: Any, time: Any, mu: Any) -> tuple[Any, Any]:
+    """Position [m] and velocity [m/s] after a time of two-body motion on an ellipse.
+
+    To rounding up to an eccentricity of 0.5. A semi-major axis above `LARGEST` distances, or none,
+    is taken for that: over a time that is short to a revolution it makes no difference.
+
+    Parameters
+    ----------
+    r, v : SX, shape (3,)
+        Inertial position [m] and velocity [m/s].
+    time : SX
+        Of either sign [s].
+    mu : SX or float
+        Gravitational parameter [m^3/s^2].
+    """
+    return _placed(r, v, time, mu, _turn(r, v, time, mu))
+
+
+def coasting(r: Any, v: Any, time: Any, mu: Any) -> Any:
+    """Derivative (6, 6) of `coasted` by position and velocity; parameters as there."""
+    turn, r0, v0 = ca.SX.sym("turn"), ca.SX.sym("r", 3), ca.SX.sym("v", 3)
+    # a step of Newton's method from where it has converged has the derivative of what it finds
+    end = ca.vertcat(*_placed(r0, v0, time, mu, _nearer(r0, v0, time, mu, turn)))
+    J = ca.jacobian(end, ca.vertcat(r0, v0))
+    return ca.substitute(J, ca.vertcat(r0, v0, turn), ca.vertcat(r, v, _turn(r, v, time, mu)))
+
+
+def _orbit(r: Any, v: Any, mu: Any) -> tuple[Any, ...]:
+    """Distance, semi-major axis, mean motion; e sin E and e cos E of the eccentric anomaly E."""
+    distance = ca.sqrt(ca.dot(r, r))
+    a = 1 / ca.fmax(2 / distance - ca.dot(v, v) / mu, 1 / (LARGEST * distance))
+    return distance, a, ca.sqrt(mu / a) / a, ca.dot(r, v) / ca.sqrt(mu * a), 1 - distance / a
+
+
+def _turn(r: Any, v: Any, time: Any, mu: Any) -> Any:
+    """Difference of eccentric anomalies over a time [rad]."""
+    turn = _orbit(r, v, mu)[2] * time
+    for _ in range(ITERATIONS):
+        turn = _nearer(r, v, time, mu, turn)
+    return turn
+
+
+def _nearer(r: Any, v: Any, time: Any, mu: Any, turn: Any) -> Any:
+    """A step of Newton's method."""
+    _, _, motion, e_sin, e_cos = _orbit(r, v, mu)
+    c, s = ca.cos(turn), ca.sin(turn)
+    missing = motion * time - (turn + e_sin * (1 - c) - e_cos * s)
+    return turn + missing / (1 + e_sin * s - e_cos * c)
+
+
+def _placed(r: Any, v: Any, time: Any, mu: Any, turn: Any) -> tuple[Any, Any]:
+    """Position and velocity where the eccentric anomaly has grown by a turn, after a time."""
+    distance, a, motion, e_sin, e_cos = _orbit(r, v, mu)
+    c, s = ca.cos(turn), ca.sin(turn)
+    after = a * (1 + e_sin * s - e_cos * c)
+    f, g = 1 - a / distance * (1 - c), time - (turn - s) / motion
+    f_rate, g_rate = -motion * a * a / (after * distance) * s, 1 - a / after * (1 - c)
+    return f * r + g * v, f_rate * r + g_rate * v
 
 
 def _angle_about(axis: FloatArray, start: FloatArray, end: FloatArray) -> float:

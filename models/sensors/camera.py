@@ -203,11 +203,11 @@ def in_view(
         Distance from the axis [m].
     """
     r_e = _EARTH_FIXED(earth_angle, r)
-    down = -r_e / np.linalg.norm(r_e, axis=1, keepdims=True)
-    off = centers - r_e[:, None]
-    depth = np.einsum("kld,kd->kl", off, down)
-    across = np.linalg.norm(off - depth[..., None] * down[:, None], axis=2)
-    above_horizon = np.einsum("ld,kld->kl", centers, off) < 0.0
+    distance = np.linalg.norm(r_e, axis=1, keepdims=True)
+    up = (r_e / distance) @ centers.T  # components of the centers
+    squared = (centers * centers).sum(axis=1)
+    depth, across = distance - up, np.sqrt(np.maximum(squared - up * up, 0.0))
+    above_horizon = squared < distance * up
     with np.errstate(invalid="ignore"):
         in_frame = np.isinf(reach)[:, None] | (across - radii < reach[:, None] * depth)
     return above_horizon & in_frame, across

@@ -14,6 +14,7 @@ from terrafix.components.judges.filter_evaluation import FilterEvaluation as Fil
 from terrafix.models.filters.ensembles import EnsembleObservation as EnsembleObservation
 from terrafix.models.filters.ensembles import ensemble_observation as ensemble_observation
 from terrafix.models.filters.error_state import Block as Block
+from terrafix.models.filters.error_state import Carried as Carried
 from terrafix.models.filters.error_state import ErrorState as ErrorState
 from terrafix.models.filters.error_state import clone as clone
 from terrafix.models.filters.error_state import considered as considered
@@ -24,7 +25,7 @@ from terrafix.models.filters.monitor import ALARMS as ALARMS
 from terrafix.models.filters.process import Process as Process
 
 __all__ = [
-    *("ALARMS", "Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState"),
+    *("ALARMS", "Block", "Carried", "EnsembleCorrect", "EnsembleObservation", "ErrorState"),
     *("FilterAcquisition", "FilterCorrect", "FilterEvaluation", "FilterMonitor", "FilterPredict"),
     *("FilterSensor", "FilterTruth", "Observation", "Process", "clone", "considered"),
     *("ensemble_observation", "rotation", "vector"),

