@@ -138,6 +138,7 @@ LAKE_FIX = {
 ORBIT_ESTIMATE = {
     "r": Field((3,), "m", "i", labels=XYZ, doc="position"),
     "v": Field((3,), "m/s", "i", labels=XYZ, doc="velocity"),
+    "age": Field((1,), "s", doc="since its correction"),
     "P": Field((6, 6), "1", doc="covariance of position [m] and velocity [m/s] error"),
 }
 """What a filter of an orbit knows."""
