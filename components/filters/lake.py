@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
+
 from terrafix.components.fields import CENTERS, CORNERS, STARTS
 from terrafix.components.filters.ensembles import EnsembleCorrect
 from terrafix.components.filters.family import FilterPredict
@@ -10,6 +14,7 @@ from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import SharedInput
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation, orbit_process
 from terrafix.models.geometry.earth import EARTH
+from terrafix.models.sensors.camera import above_horizon, ground_in_view
 
 
 class OrbitPredict(FilterPredict):
@@ -50,6 +55,23 @@ class LakeCorrect(EnsembleCorrect):
     vertices = SharedInput(**CORNERS, doc="of the rings of all lakes")
     starts = SharedInput(**STARTS, doc="of rings in the vertices")
     center = SharedInput(**CENTERS, doc="of each lake")
+    prior: Any
+
+    def _ask(self) -> None:
+        """Predict, but for members by whose estimate the lake that was seen cannot be."""
+        who = np.flatnonzero(self.fix.fresh & self.environment.active)
+        if not len(who):
+            return
+        given = self._given(who, 1)
+        C, o = ground_in_view({"r": self.prior.r[who], "v": self.prior.v[who]}, given)[:2]
+        lake = self.fix.lake[who, 0].astype(np.int64)
+        lost = who[~above_horizon(C, o, self.center)[np.arange(len(who)), lake]]
+        self.fail(
+            np.isin(np.arange(self.n_members), lost),
+            "the lake that the camera sees is below the horizon of the estimate, or behind it; "
+            "start from a better one, and see that camera and filter share catalog and earth_angle0",
+        )
+        super()._ask()
 
 
 class ConsideredLakeCorrect(LakeCorrect):

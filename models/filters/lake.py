@@ -109,8 +109,8 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
 
     def predict(values: Arrays, given: Arrays) -> FloatArray:
         found = np.empty((len(values["r"]), len(MOMENTS)))
-        for rows, _, m, _ in both(values, given):
-            found[rows] = m
+        for rows, seen, m, _ in both(values, given):
+            found[rows] = np.where(seen.depth.min(axis=1, keepdims=True) > 0.0, m, np.nan)
         return found
 
     def derivative(values: Arrays, given: Arrays) -> FloatArray:

@@ -284,7 +284,8 @@ def _cleaned(given: ArrayLike, what: str, *, outer: bool) -> FloatArray:
     if len(np.unique(p, axis=0)) < 3:
         lines = "" if given_points < 3 else " on a line that runs out and back"
         raise ValueError(
-            f"{what} has {given_points} distinct points{lines}, and a ring has at least three"
+            f"{what} has {given_points} distinct points{lines}, and a ring has at least three\n"
+            "  leave it out, or export the lake as a polygon"
         )
     s = _vector_area(p)
     size = float(np.linalg.norm(s))

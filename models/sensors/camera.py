@@ -115,9 +115,43 @@ def _pixel(d: Any, focal: Any, principal: Any) -> Any:
     return found, ca.jacobian(found, d)
 
 
-_EARTH_FIXED = over_members(rotate_about_pole, (), (3,))
 _VIEW = over_members(_view, (3,), (3,), (3,), ())
 _PIXEL = over_members(_pixel, (3,), (), (2,))
+
+
+def ground_in_view(
+    values: Mapping[str, FloatArray], given: Mapping[str, FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Where k cameras have the ground: a point q, Earth-fixed, is at C q - o in camera axes.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray, shape (k, size)
+        ``r``, ``v``; ``attitude``, zero where absent.
+    given : mapping of str to ndarray, shape (k, size)
+        `CAMERA`, and the time ``t`` [s].
+
+    Returns
+    -------
+    C : ndarray, shape (k, 3, 3)
+        Earth-fixed to camera axes.
+    o : ndarray, shape (k, 3)
+        The camera's own place, in its axes [m].
+    dC, do : ndarray, shape (k, 9, 9) and (k, 3, 9)
+        Their derivatives by r, v, attitude; of C row by row.
+    """
+    r, v, attitude = (_rows(values, name) for name in ("r", "v", "attitude"))
+    told = {n: np.reshape(given[n], len(r)) for n in ("earth_angle0", "rotation_rate", "t")}
+    found: tuple[FloatArray, FloatArray, FloatArray, FloatArray] = _VIEW(
+        r, v, attitude, told["earth_angle0"] + told["rotation_rate"] * told["t"]
+    )
+    return found
+
+
+def _rows(values: Mapping[str, FloatArray], name: str) -> FloatArray:
+    """A block of every estimate (k, size), zero where it is absent."""
+    shape = len(values["r"]), STATE_SIZES[name]
+    return np.reshape(values.get(name, np.zeros(shape)), shape)
 
 
 class Seen:
@@ -148,19 +182,16 @@ class Seen:
         points: FloatArray,
         middle: FloatArray,
     ) -> None:
-        k = len(values["r"])
-        r, v, attitude, scale = (
-            np.reshape(values.get(name, np.zeros((k, size))), (k, size))
-            for name, size in STATE_SIZES.items()
+        self._C, offset, self._dC, self._do = ground_in_view(values, given)
+        scale, focal, principal = (
+            _rows(values, "scale"),
+            *(np.reshape(given[name], (len(offset), -1)) for name in ("focal", "principal")),
         )
-        told = {name: np.reshape(given[name], (k, -1)) for name in (*CAMERA, "t")}
-        angle = told["earth_angle0"] + told["rotation_rate"] * told["t"]
-        self._C, offset, self._dC, self._do = _VIEW(r, v, attitude, angle[:, 0])
         self._off_middle = points - middle
         self._q = points + scale[:, :, None] * self._off_middle
         d = self._q @ self._C.transpose(0, 2, 1) - offset[:, None]
         self.depth = d[..., 2]
-        self.pixels, self._by_d = _PIXEL(d, told["focal"], told["principal"][:, None])
+        self.pixels, self._by_d = _PIXEL(d, focal, principal[:, None])
 
     def derivative(self, by_pixels: FloatArray) -> FloatArray:
         """Derivative (k, m, 10) by r, v, attitude, scale of what has this one (k, m, K, 2)."""
@@ -175,20 +206,14 @@ class Seen:
 
 
 def in_view(
-    r: FloatArray,
-    earth_angle: FloatArray,
-    centers: FloatArray,
-    radii: FloatArray,
-    reach: FloatArray,
+    C: FloatArray, o: FloatArray, centers: FloatArray, radii: FloatArray, reach: FloatArray
 ) -> tuple[NDArray[np.bool_], FloatArray]:
-    """Which circles on the ground a camera that looks down may see, and how far off its axis.
+    """Which circles on the ground a camera may see, and how far off its axis.
 
     Parameters
     ----------
-    r : ndarray, shape (k, 3)
-        Positions, inertial [m].
-    earth_angle : ndarray, shape (k,)
-        [rad]
+    C, o : ndarray, shape (k, 3, 3) and (k, 3)
+        Of `ground_in_view`.
     centers : ndarray, shape (L, 3)
         Earth-fixed [m].
     radii : ndarray, shape (L,)
@@ -202,12 +227,49 @@ def in_view(
     across : ndarray, shape (k, L)
         Distance from the axis [m].
     """
-    r_e = _EARTH_FIXED(earth_angle, r)
-    down = -r_e / np.linalg.norm(r_e, axis=1, keepdims=True)
-    off = centers - r_e[:, None]
-    depth = np.einsum("kld,kd->kl", off, down)
-    across = np.linalg.norm(off - depth[..., None] * down[:, None], axis=2)
-    above_horizon = np.einsum("ld,kld->kl", centers, off) < 0.0
+    d = centers @ C.transpose(0, 2, 1) - o[:, None]
+    depth, across = d[..., 2], np.linalg.norm(d[..., :2], axis=2)
     with np.errstate(invalid="ignore"):
         in_frame = np.isinf(reach)[:, None] | (across - radii < reach[:, None] * depth)
-    return above_horizon & in_frame, across
+    return above_horizon(C, o, centers) & in_frame, across
+
+
+def above_horizon(C: FloatArray, o: FloatArray, centers: FloatArray) -> NDArray[np.bool_]:
+    """Whether a camera is above the horizon of points on the ground (L, 3) [m]: (k, L)."""
+    r_e = np.einsum("kji,kj->ki", C, o)
+    return np.asarray(np.einsum("ki,li->kl", r_e, centers) > (centers * centers).sum(axis=1))
+
+
+def nearest_to_axis(
+    C: FloatArray, o: FloatArray, centers: FloatArray
+) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Which point on the ground each camera's axis comes nearest to, and how near.
+
+    Those below the horizon come after all others.
+
+    Parameters
+    ----------
+    C, o : ndarray, shape (k, 3, 3) and (k, 3)
+        Of `ground_in_view`.
+    centers : ndarray, shape (L, 3)
+        Earth-fixed [m].
+
+    Returns
+    -------
+    index : ndarray of int, shape (k,)
+    angle : ndarray, shape (k,)
+        Between the axis and the line to it [rad]; pi where it is below the horizon.
+    distance : ndarray, shape (k,)
+        Along the ground, from the point below the camera [m].
+    """
+    d = centers @ C.transpose(0, 2, 1) - o[:, None]
+    off = np.arctan2(np.linalg.norm(d[..., :2], axis=2), d[..., 2])
+    r_e = np.einsum("kji,kj->ki", C, o)
+    radius = np.linalg.norm(centers, axis=1)
+    cosine = np.einsum("ki,li->kl", r_e, centers) / radius
+    cosine /= np.linalg.norm(r_e, axis=1, keepdims=True)
+    along = radius * np.arccos(np.clip(cosine, -1.0, 1.0))
+    seen = above_horizon(C, o, centers)
+    index = np.where(seen, off, np.pi + along).argmin(axis=1)
+    rows = np.arange(len(o))
+    return index, np.where(seen, off, np.pi)[rows, index], along[rows, index]

@@ -1,6 +1,7 @@
 """A satellite over a lake: its filter is consistent, and what it is not told is seen."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -150,11 +151,86 @@ def test_what_is_not_wholly_in_the_frame_makes_no_fix(outline, name, value):
     assert not result.evaluation.get("fixes")
 
 
-def test_a_lake_that_is_not_in_view_is_not_seen(outline):
-    """The same pass an hour later: the Earth has turned by 15 degrees."""
-    later = [(f"{n}.earth_angle0", "45 deg") for n in ("orbit", "camera", "correct")]
-    result = tf.simulate(read(outline, *TEN_HZ, *later), members=2, duration="1")
+def turned(angle):
+    return [(f"{n}.earth_angle0", angle) for n in ("orbit", "camera", "correct")]
+
+
+def warnings(caplog):
+    return [r.getMessage() for r in caplog.records if r.name.startswith("terrafix")]
+
+
+def test_a_lake_that_is_never_in_view_is_said_with_what_it_was_missed_by(outline, caplog):
+    """The camera takes the Earth to be turned by 8 deg, at 42.6 N by 655 km, and 20 km are to go.
+
+    A point at an angle a around the Earth is seen atan(R sin a / (r - R cos a)) off the axis.
+    """
+    system = read(outline, *TEN_HZ, ("camera.earth_angle0", "38 deg"))
+    result = tf.simulate(system, members=2, duration="1")
     assert not result.evaluation.get("fixes")
+    (said,) = warnings(caplog)
+    found = re.fullmatch(
+        r"'camera' never had a lake in the frame in any of 2 members: the nearest, lake 0 of its "
+        r"catalog \(latitude 42\.64, longitude -76\.89 deg\), came to ([\d.]+) deg of the optical "
+        r"axis at t = ([\d.]+) s, (\d+) km along the ground from the point below; the frame "
+        r"reaches 6\.4 deg\n  check the orbit and camera\.earth_angle0, or select lakes under its "
+        r"track in the catalog",
+        said,
+    )
+    angle, t, distance = map(float, found.groups())
+    assert t == 1.0  # it flies to it
+    a = distance / 6371.0
+    off = np.arctan2(6371 * np.sin(a), 6928 - 6371 * np.cos(a))
+    assert angle == pytest.approx(np.degrees(off), abs=0.1)
+    assert distance == pytest.approx(655 + 20, abs=5)
+
+
+def test_a_lake_beyond_the_horizon_is_said_to_be_there(outline, caplog):
+    tf.simulate(read(outline, *TEN_HZ, *turned("150 deg")), members=1, duration="0.5")
+    (said,) = warnings(caplog)
+    assert said.startswith("'camera' never had a lake in the frame: all lay below the horizon or")
+    assert re.search(
+        r"came to [78],\d{3} km along the ground from the point below, at t = 0\.5", said
+    )
+
+
+def test_a_lake_that_is_always_cut_by_the_frame_is_said_with_how_much_of_it_was_seen(
+    outline, caplog
+):
+    """The frame's lower border cuts it; the share is that of the best of all contours told."""
+    system = read(outline, *TEN_HZ, ("camera.size", "[320, 50] px"))
+    system.record("looks", [system.find("camera")["contour"]], period="0.1")
+    result = tf.simulate(system, members=1, duration="1")
+    (said,) = warnings(caplog)
+    share = int(
+        re.search(r"and moments take a whole one: at best (\d+) % of the vertices", said)[1]
+    )
+    seen = result.dataset["camera.contour"].values[1:, 0, :120]
+    inside = ((seen > -0.5) & (seen < np.array([320, 50]) - 0.5)).all(axis=-1).mean(axis=1)
+    assert share == pytest.approx(100 * inside.max(), abs=2)  # some are noise of 0.25 px over it
+    assert 0 < share < 100
+    assert "measure the part of the shore that is seen" in said
+
+
+def test_members_that_saw_a_lake_are_not_complained_of_nor_is_a_run_that_goes_on(outline, caplog):
+    """What was seen before a checkpoint counts after it."""
+    half = tf.Simulation(read(outline, *TEN_HZ), members=2)
+    half.run_until("0.5")
+    saved = half.get_state()
+    again = tf.Simulation(read(outline, *TEN_HZ, *turned("30 deg")), members=2)
+    again.set_state(saved)
+    again.run_until("0.6")
+    again.master.terminate()
+    half.master.terminate()
+    assert not warnings(caplog)
+
+
+def test_an_estimate_that_could_not_see_the_lake_fails_its_member_alone(outline):
+    """Its start is drawn 20,000 km per axis off: the lake is below its horizon, or behind it."""
+    system = read(outline, *TEN_HZ, ("last_known.position_sigma", "20000 km"), case="T1")
+    result = tf.simulate(system, members=8, duration="0.1")
+    reasons = {e["reason"][:72] for e in result.excluded}
+    assert reasons == {"the lake that the camera sees is below the horizon of the estimate, or b"}
+    assert 0 < len(result.excluded) < 8
 
 
 def test_the_printed_system_is_as_a_correct_one_was_measured():

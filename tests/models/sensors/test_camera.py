@@ -10,7 +10,16 @@ import pytest
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
 from terrafix.models.geometry.geodesy import ecef
 from terrafix.models.images.polygons import moments
-from terrafix.models.sensors.camera import Seen, focal_length, in_view, nadir_axes, pixel, turned
+from terrafix.models.sensors.camera import (
+    Seen,
+    focal_length,
+    ground_in_view,
+    in_view,
+    nadir_axes,
+    nearest_to_axis,
+    pixel,
+    turned,
+)
 
 DATA = Path(os.environ.get("TERRAFIX_DATA", Path(__file__).parents[4] / "shared" / "data"))
 R0 = np.array([3477.4e3, -3719.3e3, 4698.1e3])  # of the paper [m]
@@ -175,20 +184,45 @@ def test_rows_of_several_lakes_are_those_of_each():
         )
 
 
+def looking_down(r, earth_angle=0.0):
+    """What cameras over the equator, whose flight is to the north, have below them."""
+    k = len(r)
+    values = {"r": r, "v": np.tile([0.0, 0.0, 7.5e3], (k, 1))}
+    turned_by = np.full((k, 1), earth_angle)
+    told = {"earth_angle0": turned_by, "rotation_rate": np.zeros((k, 1)), "t": np.zeros((k, 1))}
+    return ground_in_view(values, told | {n: v for n, v in given(k).items() if n not in told})[:2]
+
+
+RADIUS = 6_378e3
+OFF = 100e3 / RADIUS
+AROUND = RADIUS * np.array(
+    [[1.0, 0, 0], [np.cos(OFF), np.sin(OFF), 0], [-1.0, 0, 0], [0, 1.0, 0]]
+)  # below, 100 km off, the antipode, a quarter around
+ABOVE = np.array([[RADIUS + 700e3, 0.0, 0.0]])
+
+
 def test_what_may_be_in_view_is_near_the_axis_and_above_the_horizon():
-    """From 700 km over the equator, reach 0.1: a circle below, one 100 km off, the antipode."""
-    radius = 6_378e3
-    off = 100e3 / radius
-    centers = radius * np.array(
-        [[1.0, 0, 0], [np.cos(off), np.sin(off), 0], [-1.0, 0, 0], [0, 1.0, 0]]
-    )
-    r = np.array([[radius + 700e3, 0.0, 0.0]])
-    seen, across = in_view(r, np.zeros(1), centers, np.zeros(4), np.array([0.1]))
+    """From 700 km over the equator, reach 0.1: 100 km less a radius of 40 are within 70 km."""
+    down = looking_down(ABOVE)
+    seen, across = in_view(*down, AROUND, np.zeros(4), np.array([0.1]))
     assert seen.tolist() == [[True, False, False, False]]
-    np.testing.assert_allclose(across[0, :2], [0.0, radius * np.sin(off)], atol=1e-6)
-    wide, _ = in_view(r, np.zeros(1), centers, np.full(4, 40e3), np.array([0.1]))
-    assert wide.tolist() == [[True, True, False, False]]  # 100 km less 40 are within 70 km
-    whole, _ = in_view(r, np.zeros(1), centers, np.zeros(4), np.array([np.inf]))
+    np.testing.assert_allclose(across[0, :2], [0.0, RADIUS * np.sin(OFF)], atol=1e-6)
+    wide, _ = in_view(*down, AROUND, np.full(4, 40e3), np.array([0.1]))
+    assert wide.tolist() == [[True, True, False, False]]
+    whole, _ = in_view(*down, AROUND, np.zeros(4), np.array([np.inf]))
     assert whole.tolist() == [[True, True, False, False]]
-    turned_by, _ = in_view(r, np.array([np.pi]), centers, np.zeros(4), np.array([0.1]))
-    assert turned_by.tolist() == [[False, False, True, False]]
+    other, _ = in_view(*looking_down(ABOVE, np.pi), AROUND, np.zeros(4), np.array([0.1]))
+    assert other.tolist() == [[False, False, True, False]]
+
+
+def test_what_is_nearest_to_the_axis_is_told_with_its_angle_and_its_way_on_the_ground():
+    """100 km off at 700 km: atan(R sin a / (700 km + R (1 - cos a))); below the horizon pi."""
+    down = looking_down(ABOVE)
+    index, angle, distance = nearest_to_axis(*down, AROUND[1:])
+    assert index.tolist() == [0]
+    depth = 700e3 + RADIUS * (1 - np.cos(OFF))
+    np.testing.assert_allclose(angle, np.arctan2(RADIUS * np.sin(OFF), depth), rtol=1e-12)
+    np.testing.assert_allclose(distance, 100e3, rtol=1e-9)
+    index, angle, distance = nearest_to_axis(*down, AROUND[2:])
+    assert index.tolist() == [1]
+    np.testing.assert_allclose([angle[0], distance[0]], [np.pi, RADIUS * np.pi / 2], rtol=1e-12)
