@@ -68,8 +68,8 @@ class LakeCorrect(EnsembleCorrect):
         lost = who[~above_horizon(C, o, self.center)[np.arange(len(who)), lake]]
         self.fail(
             np.isin(np.arange(self.n_members), lost),
-            "the lake that the camera sees is below the horizon of the estimate, or behind it; "
-            "start from a better one, and see that camera and filter share catalog and earth_angle0",
+            "the lake that the camera sees is below the horizon of the estimate; start from a "
+            "better one, and see that camera and filter share catalog and earth_angle0",
         )
         super()._ask()
 

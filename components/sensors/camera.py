@@ -145,7 +145,7 @@ class LakeCamera(Component):
         corner = np.maximum(self.principal, self.size - self.principal)[rows][of]
         reach = np.degrees(np.arctan(np.linalg.norm(corner) / self.focal[rows][of]))
         if angle > np.pi / 2:
-            missed = f"all lay below the horizon or behind it; {named} came nearest {far}"
+            missed = f"all lay below the horizon or behind the camera; {named} came nearest {far}"
         else:
             missed = (
                 f"the nearest, {named}, came to {np.degrees(angle):.1f} deg of the optical axis "
