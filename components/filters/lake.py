@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafix.components.fields import CENTERS, CORNERS, STARTS
 from terrafix.components.filters.ensembles import EnsembleCorrect
 from terrafix.components.filters.family import FilterPredict
+from terrafix.components.sensors.optics import Optics
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import SharedInput
@@ -40,22 +42,24 @@ class ConsideredOrbitPredict(OrbitPredict):
     scale_sigma0 = Parameter(0.0, minimum=0.0, doc="of the scale of outlines in the catalog")
 
 
-class LakeCorrect(EnsembleCorrect):
+class LakeCorrect(Optics, EnsembleCorrect):
     """Correction of an orbit by the moments of a lake's outline in the frame of a camera."""
 
     default_rate = Rate("1/30")
     error_state, observation = ORBIT, lake_observation(ORBIT)
 
-    focal = Parameter(unit="px", positive=True, doc="focal length of the camera")
-    principal = Parameter([160.0, 128.0], shape=(2,), unit="px", doc="its principal point")
-    earth_angle0 = Parameter(0.0, unit="rad", doc="inertial to Earth-fixed x axis at t = 0")
-    rotation_rate = Parameter(
-        EARTH.rotation_rate, unit="rad/s", doc="Earth rotation, as the filter knows it"
-    )
     vertices = SharedInput(**CORNERS, doc="of the rings of all lakes")
     starts = SharedInput(**STARTS, doc="of rings in the vertices")
     center = SharedInput(**CENTERS, doc="of each lake")
     prior: Any
+
+    def _initialize_impl(self) -> None:
+        self.check_pointing()
+        super()._initialize_impl()
+
+    def _given(self, who: NDArray[np.int64], n_points: int) -> dict[str, Any]:
+        own = {n: np.repeat(v, n_points, axis=0) for n, v in self.looking(who).items()}
+        return super()._given(who, n_points) | own
 
     def _ask(self) -> None:
         """Predict, but for members by whose estimate the lake that was seen cannot be."""

@@ -19,6 +19,7 @@ from terrafix.components.fields import (
     STARTS,
     XYZ,
 )
+from terrafix.components.sensors.optics import Optics
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -34,10 +35,10 @@ from terrafix.models.images.rendering import (
     render_scene,
 )
 from terrafix.models.sensors.camera import (
-    CAMERA,
     Seen,
     ground_in_view,
     in_view,
+    lens_grows,
     nearest_to_axis,
 )
 
@@ -47,22 +48,18 @@ CLIPPING = ("frame", "none")
 """What becomes of an outline that is not wholly in the frame."""
 
 
-class LakeCamera(Component):
-    """Outlines of lakes in the frame of a camera that looks to the center of the Earth.
+class LakeCamera(Optics):
+    """Outlines of lakes in the frame of a camera.
 
-    Its attitude is that of the flight: the optical axis to the center of the Earth, the velocity
-    upward in the frame, but for a misalignment that every member draws once. Each frame shows one
+    It looks down, the velocity upward in the frame, or as the body is turned that carries it, but
+    for its mounting and for a misalignment that every member draws once. Each frame shows one
     lake, the nearest to its center of those that are wholly in it, or in it at all. A run in which
     it never had one says by how much.
     """
 
     default_rate = Rate("1/30")
 
-    focal = Parameter(unit="px", positive=True, doc="focal length: width / (2 tan(angle / 2))")
     size = Parameter([320.0, 256.0], shape=(2,), unit="px", positive=True, doc="of the frame")
-    principal = Parameter([160.0, 128.0], shape=(2,), unit="px", doc="principal point")
-    earth_angle0 = Parameter(0.0, unit="rad", doc="inertial to Earth-fixed x axis at t = 0")
-    rotation_rate = Parameter(EARTH.rotation_rate, unit="rad/s", doc="Earth rotation")
     vertex_sigma = Parameter(0.25, unit="px", minimum=0.0, doc="noise of every vertex")
     attitude_sigma = Parameter(
         0.0, unit="rad", minimum=0.0, doc="of the misalignment about each axis, drawn once"
@@ -89,6 +86,15 @@ class LakeCamera(Component):
 
     def _initialize_impl(self) -> None:
         n = self.n_members
+        self.check_pointing()
+        for lens, focal, size in zip(self.lens, self.focal, self.size, strict=True):
+            reach = float(np.linalg.norm(size) / focal)
+            if not lens_grows(lens, reach):
+                raise ConfigurationError(
+                    f"'{self.name}.lens' folds the scene back into the frame within "
+                    f"{np.degrees(np.arctan(reach)):.1f} deg of the axis: its radial part does not "
+                    "grow there\n  calibrate it over the whole frame, or take a smaller one"
+                )
         self.attitude = self.attitude_sigma[:, None] * self.normals("attitude", 3)
         self._longest = longest = int(np.diff(self.starts[: len(self.center) + 1]).max())
         if longest > MOST_VERTICES:
@@ -199,8 +205,7 @@ class LakeCamera(Component):
     def _own(self, rows: NDArray[np.int64], t: float) -> tuple[dict[str, Any], dict[str, Any]]:
         """What members' looks depend on: their states, and the camera's constants."""
         values = {"r": self.r_i[rows], "v": self.v_i[rows], "attitude": self.attitude[rows]}
-        given = {name: getattr(self, name)[rows] for name in CAMERA} | {"t": np.full(len(rows), t)}
-        return values, given
+        return values, self.looking(rows) | {"t": np.full(len(rows), t)}
 
     def _outline(
         self, lake: int, rows: NDArray[np.int64], t: float

@@ -39,7 +39,7 @@ from terrafix.models.filters.measurement import TIME
 from terrafix.models.filters.process import Process
 from terrafix.models.images.polygons import moments
 from terrafix.models.motion.gravity import j2_acceleration
-from terrafix.models.sensors.camera import CAMERA, STATE_SIZES, Seen
+from terrafix.models.sensors.camera import CAMERA, POINTING, STATE_SIZES, Seen
 
 ORBIT = ErrorState(vector("r", unit="m", frame="i"), vector("v", unit="m/s", frame="i"))
 """Position and velocity, inertial."""
@@ -93,7 +93,7 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
             rows = np.flatnonzero(lakes == lake)
             begin, end = np.asarray(given["starts"][lake : lake + 2], dtype=np.int64)
             own = {n: v[rows] for n, v in values.items()}
-            told = {n: given[n][rows] for n in (*CAMERA, TIME)}
+            told = {n: given[n][rows] for n in (*CAMERA, *POINTING, TIME) if n in given}
             yield rows, Seen(own, told, given["vertices"][begin:end], given["center"][lake])
 
     # both are asked of the same estimates: what they see is kept from one to the other
