@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.components.fields import CENTERS, CORNERS, STARTS
+from terrafix.components.fields import CENTERS, CORNERS, OWNER, STARTS
 from terrafix.components.filters.ensembles import EnsembleCorrect
 from terrafix.components.filters.family import FilterPredict
-from terrafix.components.sensors.optics import Optics
+from terrafix.components.sensors.optics import Optics, say_islands_left_out
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import SharedInput
@@ -51,10 +51,12 @@ class LakeCorrect(Optics, EnsembleCorrect):
     vertices = SharedInput(**CORNERS, doc="of the rings of all lakes")
     starts = SharedInput(**STARTS, doc="of rings in the vertices")
     center = SharedInput(**CENTERS, doc="of each lake")
+    owner = SharedInput(**OWNER, optional=True, doc="lake of each ring; where islands are to count")
     prior: Any
 
     def _initialize_impl(self) -> None:
         self.check_pointing()
+        say_islands_left_out(self.name, self.vertices, self.starts, self.center, self.owner)
         super()._initialize_impl()
 
     def _given(self, who: NDArray[np.int64], n_points: int) -> dict[str, Any]:

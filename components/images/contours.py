@@ -13,7 +13,7 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import MessageInput, MessageOutput, Output
 from terrafix.models.images.coastline import coastline, gray_moments
-from terrafix.models.images.polygons import moment_noise, moments
+from terrafix.models.images.polygons import moment_noise, moments, split_rings
 
 _log = logging.getLogger(__name__)
 
@@ -55,11 +55,12 @@ class ContourMoments(Component):
         contour, look, n, m = self.contour, self.look, self.n_members, len(LAKE_MOMENTS)
         y, R = np.zeros((n, m)), np.tile(np.eye(m), (n, 1, 1))
         good = contour.fresh & look.fresh & (look.whole > 0.5)
-        for count in np.unique(contour.count[good]):
-            rows = np.flatnonzero(good & (contour.count == count))
-            outline = contour.value[rows, :count]
-            y[rows] = moments(outline)[0]
-            R[rows], bias = moment_noise(outline, look.sigma[rows])
+        kinds = np.stack([contour.count, look.lake], axis=1)
+        for count, lake in np.unique(kinds[good], axis=0):
+            rows = np.flatnonzero(good & (kinds == [count, lake]).all(axis=1))
+            outline, starts = split_rings(contour.value[rows, : int(count)])
+            y[rows] = moments(outline, starts)[0]
+            R[rows], bias = moment_noise(outline, look.sigma[rows], starts)
             if self.unbiased:
                 y[rows] -= bias
         if self.noise == "given":

@@ -15,11 +15,12 @@ from terrafix.components.fields import (
     FRAME,
     LOOK,
     MOST_VERTICES,
+    OWNER,
     RADII,
     STARTS,
     XYZ,
 )
-from terrafix.components.sensors.optics import Optics
+from terrafix.components.sensors.optics import Optics, say_islands_left_out
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -28,12 +29,14 @@ from terrafix.cosim.declare.parameters import Choice, Count, Parameter
 from terrafix.cosim.declare.ports import Input, MessageInput, MessageOutput, Output, SharedInput
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.geodesy import geodetic
+from terrafix.models.images.polygons import split_rings
 from terrafix.models.images.rendering import (
     Appearance,
     cloud_opacity,
     render_polygon,
     render_scene,
 )
+from terrafix.models.maps.outlines import rings_of
 from terrafix.models.sensors.camera import (
     Seen,
     ground_in_view,
@@ -79,6 +82,9 @@ class LakeCamera(Optics):
     starts = SharedInput(**STARTS, doc="of rings in the vertices")
     center = SharedInput(**CENTERS, doc="of each lake")
     radius = SharedInput(**RADII, doc="around each center")
+    owner = SharedInput(
+        **OWNER, optional=True, doc="lake of each ring; where islands are to be seen"
+    )
 
     contour = MessageOutput(**CONTOUR, doc="vertices of the lake's outline in the frame")
     look = MessageOutput(fields=LOOK, doc="which lake it is, and how well it is seen")
@@ -96,11 +102,14 @@ class LakeCamera(Optics):
                     "grow there\n  calibrate it over the whole frame, or take a smaller one"
                 )
         self.attitude = self.attitude_sigma[:, None] * self.normals("attitude", 3)
-        self._longest = longest = int(np.diff(self.starts[: len(self.center) + 1]).max())
+        say_islands_left_out(self.name, self.vertices, self.starts, self.center, self.owner)
+        lakes = range(len(self.center))
+        self._rings = [rings_of(k, self.starts, self.owner) for k in lakes]
+        self._longest = longest = max(len(i) + len(b) - 1 for i, b in self._rings)
         if longest > MOST_VERTICES:
             raise ConfigurationError(
                 f"'{self.name}' sees outlines of {MOST_VERTICES} vertices at most; its catalog has "
-                f"one of {longest}\n  select smaller lakes, or a coarser source"
+                f"one of {longest}, islands included\n  select smaller lakes, or a coarser source"
             )
         self._moved = None
         if self.catalog_sigma.any():
@@ -210,17 +219,23 @@ class LakeCamera(Optics):
     def _outline(
         self, lake: int, rows: NDArray[np.int64], t: float
     ) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Pixels (k, K, 2) of a lake's vertices, and which of them are in the frame."""
-        begin, end = self.starts[lake : lake + 2]
-        points = self.vertices[begin:end]
+        """Pixels (k, K, 2) of a lake's vertices, and which of them are in the frame.
+
+        Between rings stands a row that is not a number, and counts as in the frame.
+        """
+        index, begins = self._rings[lake]
+        points = self.vertices[index]
         if self._moved is not None:
-            points = points + self._moved[rows, begin:end]
+            points = points + self._moved[rows][:, index]
         seen = Seen(*self._own(rows, t), points, self.center[lake])
         inside = seen.depth > 0.0
         if self.clipping == "frame":
             size = self.size[rows, None]
             inside &= ((seen.pixels > -0.5) & (seen.pixels < size - 0.5)).all(axis=2)
-        return seen.pixels, inside
+        if len(begins) == 1:
+            return seen.pixels, inside
+        gaps = begins[1:]
+        return np.insert(seen.pixels, gaps, np.nan, axis=1), np.insert(inside, gaps, True, axis=1)
 
     def _candidates(self, C: FloatArray, o: FloatArray) -> NDArray[np.int64]:
         """Lakes that may be in each member's frame, nearest to the axis first; -1 for none."""
@@ -267,7 +282,9 @@ class LakeImager(Component):
         seen = self.contour.fresh & self.look.fresh & self.environment.active
         draws = self.normals("noise", 1)[:, 0]
         for m in np.flatnonzero(seen):
-            outline = self.contour.value[m, : self.contour.count[m]]
+            told = self.contour.value[m, : self.contour.count[m]]
+            vertices, begins = split_rings(told)
+            outline, *islands = np.split(vertices, begins[1:])
             rng = np.random.default_rng(draws[m : m + 1].view(np.uint64))
             look = Appearance(
                 water=float(self.water[m]),
@@ -278,6 +295,7 @@ class LakeImager(Component):
             )
             share = float(self.clouds[m])
             opacity = cloud_opacity(width, height, share, rng) if share else None
-            covered = render_polygon(outline, width, height, blur=float(self.blur[m]))
+            blur = float(self.blur[m])
+            covered = render_polygon(outline, width, height, islands, blur=blur)
             images[m] = render_scene(covered, look, rng, opacity)
         self.image.publish(self.look.t, images, valid=seen)

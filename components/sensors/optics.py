@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import Input
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.sensors.camera import BROWN, CAMERA, POINTINGS
+
+_log = logging.getLogger(__name__)
 
 DISTORTIONS = ("none", "brown")
 """What the lens does to the picture."""
@@ -66,3 +70,26 @@ class Optics(Component):
         law = np.full((len(rows), 1), float(POINTINGS.index(self.pointing)))
         constants = {name: getattr(self, name)[rows] for name in CAMERA}
         return constants | {"pointing": law, "q_be": self.q_be[rows]}
+
+
+def say_islands_left_out(
+    name: str,
+    vertices: FloatArray,
+    starts: NDArray[np.int64],
+    center: FloatArray,
+    owner: NDArray[np.int64] | None,
+) -> None:
+    """Warn of islands of a catalog that a component does not count, with their area."""
+    n_lakes, n_rings = len(center), len(starts) - 1
+    if owner is not None or n_rings == n_lakes:
+        return
+    rings = (vertices[starts[k] : starts[k + 1]] for k in range(n_lakes, n_rings))
+    area = sum(
+        float(np.linalg.norm(np.cross(p - p[0], np.roll(p, -1, axis=0) - p[0]).sum(axis=0))) / 2
+        for p in rings
+    )
+    _log.warning(
+        "'%s' leaves out the %d islands of its catalog, %.3g km^2\n  connect the catalog's owner "
+        "to camera and filter, or set its islands = false",
+        *(name, n_rings - n_lakes, area / 1e6),
+    )

@@ -31,6 +31,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.filters.ensembles import Arrays, EnsembleObservation
@@ -38,6 +39,7 @@ from terrafix.models.filters.error_state import ErrorState, considered, vector
 from terrafix.models.filters.measurement import TIME
 from terrafix.models.filters.process import Process
 from terrafix.models.images.polygons import moments
+from terrafix.models.maps.outlines import rings_of
 from terrafix.models.motion.gravity import j2_acceleration
 from terrafix.models.sensors.camera import CAMERA, POINTING, STATE_SIZES, Seen
 
@@ -61,8 +63,9 @@ MOMENTS = {
 }
 """Measured elements: area, centroid, second central moments of an outline in the frame."""
 
-CATALOG = ("vertices", "starts", "center")
-"""Shared arrays of a lake catalog: all vertices, where each lake's begin, the lakes' middles."""
+CATALOG = ("vertices", "starts", "center", "owner")
+"""Shared arrays of a lake catalog: all vertices, where each ring's begin, the lakes' middles, and
+which lake a ring is of; without it islands do not count."""
 
 
 def orbit_process() -> Process:
@@ -86,15 +89,17 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
     begins = dict(zip(STATE_SIZES, np.cumsum([0, *STATE_SIZES.values()]), strict=False))
     columns = [begins[block.name] + i for block in state for i in range(block.size)]
 
-    def each_lake(values: Arrays, given: Arrays) -> Iterator[tuple[Any, Seen]]:
-        """Rows of the estimates that look at one lake, and its outline, lake by lake."""
+    def each_lake(
+        values: Arrays, given: Arrays
+    ) -> Iterator[tuple[NDArray[np.intp], Seen, tuple[int, ...]]]:
+        """Rows of the estimates that look at one lake, its outline and the starts of its rings."""
         lakes = np.asarray(given["lake"]).reshape(-1).astype(np.int64)
         for lake in np.unique(lakes):
             rows = np.flatnonzero(lakes == lake)
-            begin, end = np.asarray(given["starts"][lake : lake + 2], dtype=np.int64)
+            index, starts = rings_of(int(lake), given["starts"], given.get("owner"))
             own = {n: v[rows] for n, v in values.items()}
             told = {n: given[n][rows] for n in (*CAMERA, *POINTING, TIME) if n in given}
-            yield rows, Seen(own, told, given["vertices"][begin:end], given["center"][lake])
+            yield rows, Seen(own, told, given["vertices"][index], given["center"][lake]), starts
 
     # both are asked of the same estimates: what they see is kept from one to the other
     kept: list[tuple[Arrays, list[Any]]] = []
@@ -103,7 +108,10 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
         last = kept[:]  # another thread may put its own there meanwhile
         if last and last[0][0] is values:
             return last[0][1]
-        looks = [(*look, *moments(look[1].pixels)) for look in each_lake(values, given)]
+        looks = [
+            (rows, seen, *moments(seen.pixels, starts))
+            for rows, seen, starts in each_lake(values, given)
+        ]
         kept[:] = [(values, looks)]
         return looks
 

@@ -422,6 +422,31 @@ class Outline:
         return np.asarray(ahead & _inside(ring, _plane(p, self._middle)))
 
 
+def rings_of(
+    lake: int, starts: NDArray[np.int64], owner: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.intp], tuple[int, ...]]:
+    """Which vertices of a catalog are those of a lake: its shore, then its islands.
+
+    Parameters
+    ----------
+    lake : int
+    starts : ndarray of int, shape (R + 1,)
+        Where rings start in the vertices, and where the last one ends; lake k's shore is ring k.
+    owner : ndarray of int, shape (R,), optional
+        Lake of each ring; without it the shore alone.
+
+    Returns
+    -------
+    ndarray of int
+    tuple of int
+        Where among them the rings start.
+    """
+    rings = [lake] if owner is None else [int(k) for k in np.flatnonzero(owner == lake)]
+    parts = [np.arange(starts[k], starts[k + 1]) for k in rings]
+    begins = np.cumsum([0, *(len(part) for part in parts[:-1])])
+    return np.concatenate(parts), tuple(int(k) for k in begins)
+
+
 def joined(parts: Sequence[Sequence[FloatArray]], what: str) -> list[list[FloatArray]]:
     """Polygons with the cuts along 180 degrees undone, which RFC 7946 (3.1.9) asks of writers.
 

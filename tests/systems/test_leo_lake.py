@@ -1,5 +1,6 @@
 """A satellite over a lake: its filter is consistent, and what it is not told is seen."""
 
+import json
 import os
 import re
 from pathlib import Path
@@ -241,3 +242,64 @@ def test_the_printed_system_is_as_a_correct_one_was_measured():
         np.testing.assert_allclose(np.median(ekf), np.median(ukf), atol=15.0)
     # it has a floor: the velocity across the track is not seen
     assert np.median(ukf) > 400.0
+
+
+def with_islands(outline, *parts, image=False):
+    """The lake with two islands; `parts` are told of them."""
+    ring = np.loadtxt(outline, delimiter=",", skiprows=1)
+    islands = [
+        [[x - w, y - h], [x - w, y + h], [x + w, y + h], [x + w, y - h], [x - w, y - h]]
+        for x, y, w, h in ((-76.872, 42.61, 0.004, 0.03), (-76.874, 42.7, 0.004, 0.02))
+    ]
+    geometry = {"type": "Polygon", "coordinates": [ring.tolist(), *islands]}
+    file = outline.with_name("islands.geojson")
+    file.write_text(json.dumps({"type": "Feature", "properties": {}, "geometry": geometry}))
+    own = [f'"lakes.owner -> {part}.owner",' for part in parts]
+    base = LAKE.with_name("leo_lake_image.toml") if image else LAKE
+    text = base.read_text().replace("connect = [", "\n".join(["connect = [", *own]))
+    system = outline.with_name("islands.toml")
+    system.write_text(text)
+    return system, file
+
+
+def test_islands_are_left_out_by_both_and_said_or_counted_by_both(outline, caplog):
+    """Left out by both and counted by both it is consistent; by one alone it is off.
+
+    The islands take 7.3 km^2. All moments together tell less of the height by the area than by the
+    length, which stays: some hundred meters.
+    """
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * 20) / 20
+    for parts, warned in (((), 2), (("camera", "correct"), 0), (("camera",), 1)):
+        caplog.clear()
+        system, file = with_islands(outline, *parts)
+        result = tf.simulate(read(file, *TEN_HZ, case="T1", file=system), members=20)
+        told = [w for w in warnings(caplog) if "leaves out the 2 islands of its catalog" in w]
+        assert len(told) == warned
+        mean = result.dataset["evaluation.nees"].values[-1].mean()
+        assert (low < mean < high) == (len(parts) != 1), (parts, mean)
+        if len(parts) == 1:
+            assert 200.0 < np.median(final(result)) < 2000.0
+
+
+def test_an_image_shows_islands_as_the_filter_takes_them(outline):
+    """Moments measured in images are those of the contour with its islands, within their noise."""
+    period = [
+        (f"{n}.period", "1 s") for n in ("camera", "imager", "moments", "correct", "evaluation")
+    ]
+    system, file = with_islands(outline, "camera", "correct", image=True)
+    seen = tf.read_system(system, [("lakes.file", str(file)), ("case", "T1"), *period])
+    seen.record("told", [seen.find("moments")["fix"]], period="1")
+    exact = tf.read_system(system, [("lakes.file", str(file)), ("case", "T1"), *period])
+    exact.replace("moments", tf.components.contour_moments(rate=tf.Rate("1")))
+    exact.remove("imager")
+    exact.connect("camera.contour", "moments.contour")
+    exact.record("told", [exact.find("moments")["fix"]], period="1")
+    images, contours = (tf.simulate(s, members=6).dataset for s in (seen, exact))
+    y, R, truth = (
+        d[f"moments.fix.{n}"].values[1:].reshape(42, *shape)
+        for d, n, shape in ((images, "y", (6,)), (images, "R", (6, 6)), (contours, "y", (6,)))
+    )
+    error = y - truth
+    squared = np.einsum("ki,kij,kj->k", error, np.linalg.inv(R), error)
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * 42) / 42
+    assert low < squared.mean() < high
