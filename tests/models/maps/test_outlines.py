@@ -14,8 +14,8 @@ from terrafix.models.maps.outlines import (
     authalic_vectors,
     crossing,
     joined,
-    rings_of,
     ring_from_degrees,
+    rings_of,
     wrapped,
 )
 
