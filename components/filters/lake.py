@@ -32,7 +32,7 @@ class OrbitPredict(FilterPredict):
 
 
 class ConsideredOrbitPredict(OrbitPredict):
-    """The same beside a misalignment and a scale that count, and are not estimated."""
+    """The same beside errors of camera and catalog that count, and are not estimated."""
 
     error_state = CONSIDERED
 
@@ -40,6 +40,9 @@ class ConsideredOrbitPredict(OrbitPredict):
         0.0, unit="rad", minimum=0.0, doc="of the camera's misalignment, per axis"
     )
     scale_sigma0 = Parameter(0.0, minimum=0.0, doc="of the scale of outlines in the catalog")
+    outline_sigma0 = Parameter(
+        0.0, unit="m", minimum=0.0, doc="of the catalog's vertices, each by itself, per axis"
+    )
 
 
 class LakeCorrect(Optics, EnsembleCorrect):
@@ -81,6 +84,6 @@ class LakeCorrect(Optics, EnsembleCorrect):
 
 
 class ConsideredLakeCorrect(LakeCorrect):
-    """The same with a misalignment and a scale that count, and are not estimated."""
+    """The same with errors of camera and catalog that count, and are not estimated."""
 
     error_state, observation = CONSIDERED, lake_observation(CONSIDERED)

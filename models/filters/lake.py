@@ -1,8 +1,8 @@
 r"""A satellite's filter that knows lakes: what it estimates, and what its camera measures.
 
 State: position and velocity, inertial; where they are considered, the camera's misalignment about
-its own axes and the scale by which the catalog's outlines are too small. Gravity with the second
-zonal harmonic, white acceleration of density :math:`Q_a`.
+its own axes, the scale by which the catalog's outlines are too small, and what the catalog's
+vertices are off. Gravity with the second zonal harmonic, white acceleration of density :math:`Q_a`.
 
 Measured are the six moments of an outline in the frame: area, centroid, second central moments. A
 vertex :math:`q_k`, Earth-fixed, lies at :math:`d_k = C q_k - o` in camera axes, whose rotation
@@ -15,6 +15,11 @@ vertex :math:`q_k`, Earth-fixed, lies at :math:`d_k = C q_k - o` in camera axes,
         - \Bigl( \sum_k G_k \Bigr) \frac{\partial o}{\partial x},
 
 each factor derived symbolically.
+
+A catalog whose vertices are off, each by itself by :math:`\sigma` per axis, biases all six moments,
+constantly but for the slow change of the view, with the covariance :math:`\sigma^2 \sum_k G_k
+G_k^T`. Let :math:`L` be the Cholesky factor of the sum: the bias is :math:`L b`, and b has six
+independent elements of :math:`\sigma`. These are considered, not the vertices.
 
 References
 ----------
@@ -50,6 +55,7 @@ CONSIDERED = ErrorState(
     *ORBIT,
     considered(vector("attitude", unit="rad", frame="c")),
     considered(vector("scale", 1)),
+    considered(vector("outline", 6, unit="m")),
 )
 """The same, with what the camera and the catalog do not know."""
 
@@ -87,7 +93,10 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
     Of blocks of `CONSIDERED`, whichever `state` has.
     """
     begins = dict(zip(STATE_SIZES, np.cumsum([0, *STATE_SIZES.values()]), strict=False))
-    columns = [begins[block.name] + i for block in state for i in range(block.size)]
+    off_outline = "outline" in [block.name for block in state]
+    columns = [
+        begins[block.name] + i for block in state if block.name in begins for i in range(block.size)
+    ]
 
     def each_lake(
         values: Arrays, given: Arrays
@@ -108,29 +117,33 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
         last = kept[:]  # another thread may put its own there meanwhile
         if last and last[0][0] is values:
             return last[0][1]
-        looks = [
-            (rows, seen, *moments(seen.pixels, starts))
-            for rows, seen, starts in each_lake(values, given)
-        ]
+        looks = []
+        for rows, seen, starts in each_lake(values, given):
+            m, J = moments(seen.pixels, starts)
+            look = {"m": m, "H": seen.derivative(J)[..., columns]}
+            if off_outline:
+                look["L"] = seen.factor(J)
+                look["m"] = m + np.einsum("kij,kj->ki", look["L"], values["outline"][rows])
+                look["H"] = np.concatenate([look["H"], look["L"]], axis=2)
+            behind = seen.depth.min(axis=1) <= 0.0
+            look["m"][behind] = np.nan
+            looks.append((rows, look))
         kept[:] = [(values, looks)]
         return looks
 
-    def predict(values: Arrays, given: Arrays) -> FloatArray:
-        found = np.empty((len(values["r"]), len(MOMENTS)))
-        for rows, seen, m, _ in both(values, given):
-            found[rows] = np.where(seen.depth.min(axis=1, keepdims=True) > 0.0, m, np.nan)
-        return found
+    def told(kind: str, *shape: int) -> Any:
+        def answer(values: Arrays, given: Arrays) -> FloatArray:
+            found = np.empty((len(values["r"]), *shape))
+            for rows, look in both(values, given):
+                found[rows] = look[kind]
+            return found
 
-    def derivative(values: Arrays, given: Arrays) -> FloatArray:
-        found = np.empty((len(values["r"]), len(MOMENTS), state.size))
-        for rows, seen, _, J in both(values, given):
-            found[rows] = seen.derivative(J)[..., columns]
-        return found
+        return answer
 
     return EnsembleObservation(
-        predict,
+        told("m", len(MOMENTS)),
         MOMENTS,
-        derivative=derivative,
+        derivative=told("H", len(MOMENTS), state.size),
         fields=[vector("lake", 1)],
         parameters=CAMERA,
         shared=CATALOG,

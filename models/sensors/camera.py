@@ -272,13 +272,33 @@ class Seen:
     def derivative(self, by_pixels: FloatArray) -> FloatArray:
         """Derivative (k, m, 10) by r, v, attitude, scale of what has this one (k, m, K, 2)."""
         k, m, n_vertices, _ = by_pixels.shape
-        by_d = np.ascontiguousarray(self._by_d.transpose(0, 2, 3, 1))[:, None]  # (k, 1, 2, 3, K)
-        u, v = (np.ascontiguousarray(by_pixels[..., i])[:, :, None] for i in range(2))
-        G = (u * by_d[:, :, 0] + v * by_d[:, :, 1]).reshape(k, m * 3, n_vertices)
+        G = self._by_places(by_pixels).reshape(k, m * 3, n_vertices)
         by_C = (G @ self._q).reshape(k, m, 9)
         found = by_C @ self._dC - G.sum(axis=2).reshape(k, m, 3) @ self._do
         about = (G @ self._off_middle).reshape(k, m, 9) @ self._C.reshape(k, 9, 1)
         return np.concatenate([found, about], axis=2)
+
+    def factor(self, by_pixels: FloatArray) -> FloatArray:
+        """Cholesky factor (k, m, m) of what vertices off by 1 m per axis, each by itself, add.
+
+        Of what has the derivative (k, m, K, 2) by pixels.
+        """
+        k, m, n_vertices, _ = by_pixels.shape
+        G = self._by_places(by_pixels).reshape(k, m, 3 * n_vertices)
+        P = G @ G.transpose(0, 2, 1)
+        P[~np.isfinite(P).all(axis=(1, 2))] = np.eye(m)  # of an estimate that is lost anyway
+        P += _DEFINITE * np.eye(m) * P.diagonal(axis1=1, axis2=2)[:, None]
+        return np.asarray(np.linalg.cholesky(P))
+
+    def _by_places(self, by_pixels: FloatArray) -> FloatArray:
+        """Derivative (k, m, 3, K) by places in camera axes of what has this one (k, m, K, 2)."""
+        by_d = np.ascontiguousarray(self._by_d.transpose(0, 2, 3, 1))[:, None]  # (k, 1, 2, 3, K)
+        u, v = (np.ascontiguousarray(by_pixels[..., i])[:, :, None] for i in range(2))
+        return np.asarray(u * by_d[:, :, 0] + v * by_d[:, :, 1])
+
+
+_DEFINITE = 1e-12
+"""Of its diagonal, what is added to a covariance that few vertices may leave singular."""
 
 
 def in_view(

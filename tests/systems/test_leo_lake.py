@@ -77,34 +77,14 @@ def test_the_noise_of_vertices_biases_second_moments_unless_it_is_taken_out(outl
 
 
 def considering(outline, *settings, **sigmas):
-    """The system with a filter that considers attitude and scale."""
+    """The system with a filter that considers errors of camera and catalog."""
     text = LAKE.read_text()
     for kind in ("orbit_predict", "lake_correct", "orbit_evaluation"):
         text = text.replace(f'type = "{kind}"', f'type = "{kind}_considered"')
-    wires = '"camera.attitude -> evaluation.attitude", "scale.scale -> evaluation.scale",\n]'
-    text = text.rstrip().removesuffix("]") + wires
-    text += '\n[component.scale]\ntype = "own_scale:Scale"\n'
     file = outline.with_name("considered.toml")
     file.write_text(text)
-    outline.with_name("own_scale.py").write_text(SCALE)
     told = [(f"predict.{name}", value) for name, value in sigmas.items()]
     return read(outline, *TEN_HZ, *settings, *told, file=file)
-
-
-SCALE = """
-import terrafix as tf
-
-
-class Scale(tf.Component):
-    default_rate = tf.Rate("0.1")
-    scale = tf.Output((1,))
-
-    def _initialize_impl(self):
-        self.scale = 0.0
-
-    def _step_impl(self, t, dt):
-        self.scale = 0.0
-"""
 
 
 def test_an_attitude_that_is_off_is_honest_once_it_is_considered(outline):
@@ -116,6 +96,18 @@ def test_an_attitude_that_is_off_is_honest_once_it_is_considered(outline):
     honest = tf.simulate(considering(outline, off, attitude_sigma0="0.02 deg"), members=50)
     assert low < honest.dataset["evaluation.nees"].values[-1].mean() < high
     assert 100.0 < np.median(final(honest)) < 600.0
+
+
+def test_a_catalog_that_is_off_is_honest_once_its_vertices_are_considered(outline):
+    """Of 100 m per vertex and axis, drawn once a member; a scale that is considered is no help."""
+    off = ("camera.catalog_sigma", "100 m")
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * 50) / 50
+    scaled = tf.simulate(considering(outline, off, scale_sigma0="0.01"), members=20)
+    assert scaled.dataset["evaluation.nees"].values[-1].mean() > 10 * high
+    honest = tf.simulate(considering(outline, off, outline_sigma0="100 m"), members=50)
+    nees = honest.dataset["evaluation.nees"].values
+    assert low < nees[35].mean() < high
+    assert low < nees[-1].mean() < high
 
 
 def test_members_alone_and_together_and_resumed_are_the_same_bytes(outline):
