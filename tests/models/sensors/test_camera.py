@@ -231,7 +231,7 @@ def test_derivatives_are_those_of_differences(trial, law):
 
 
 def test_the_factor_of_an_outline_is_that_of_vertices_that_are_drawn():
-    """Moments of 20,000 outlines whose vertices are off by 1 m: of a smooth ellipse 30 m are not small."""
+    """Of moments of 20,000 outlines off by 1 m; for a smooth ellipse 30 m are not small."""
     points, told = ellipse(), given() | catalog(ellipse())
     values = {"r": R0[None], "v": V0[None], "outline": np.zeros((1, 6))}
     L = lake_observation(CONSIDERED).derivative(values, told)[0, :, -6:]
