@@ -6,7 +6,8 @@ Mark Twain Lake, Missouri, a reservoir of many arms: what the camera sees is the
 (Landsat 9, NDVI below 0.1), what the filter knows is the surface that the Shuttle found flat in
 February 2000 (SRTM, 181 m). How far the two outlines differ, and what the difference does to the
 position; with what the filter considers of it. Two frames a second over seven seconds, by contours
-and through images. Needs both files (TERRAFIX_DATA).
+of 300 m a pixel and through images of 150 m: in coarser ones arms of less than a pixel run together
+with land, and are taken for the edges of clouds. Needs both files (TERRAFIX_DATA).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ METERS = np.array([111_412.8 * np.cos(LATITUDE) - 93.5 * np.cos(3 * LATITUDE), 1
 HEIGHT = 150.0  # 181 m above the sea, 31 m of geoid below the ellipsoid
 TOLERANCE = 30.0  # of the vertices that are left out: a pixel of both sources [m]
 ISLAND = 30e3  # smallest that is kept [m^2]
-FOCAL = 1828.81
+FOCAL = {False: "1828.81 px", True: "3657.62 px"}  # of contours, of images
 
 
 def largest_lake(file: str) -> Any:
@@ -135,6 +136,7 @@ def system(
     settings = [(f"{n}.period", "0.5 s") for n in parts]
     settings += [(f"{n}.period", "0.1 s") for n in ("orbit", "predict")]
     settings += [("lakes.file", str(known)), ("water.file", str(seen)), ("case", case)]
+    settings += [(f"{n}.focal", FOCAL[image]) for n in ("camera", "correct")]
     settings += [(f"{n}.height", f"{HEIGHT} m") for n in ("lakes", "water")]
     settings += [(f"orbit.{n}", value) for n, value in orbit.items()]
     settings += [(f"predict.{n}_sigma0", value) for n, value in considered.items()]
