@@ -53,7 +53,9 @@ benchmarks: $(STAMP)
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
 	    then $(BIN)/python benchmarks/real_echo.py; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/lakes_gshhg"; \
-	    then $(BIN)/python benchmarks/lake.py; fi
+	    then $(BIN)/python benchmarks/lake.py; $(BIN)/python benchmarks/integer_contours.py; fi
+	@if test -f "$${TERRAFIX_DATA:-../shared/data}/dem/mark_twain_ndvi_2025.tif"; \
+	    then $(BIN)/python benchmarks/real_lake.py; fi
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -37,7 +37,7 @@ MOST = 256
 def _both(values: Mapping[str, Any], given: Mapping[str, Any]) -> tuple[Any, Any]:
     k = len(values["r"])
     y, H = np.empty((k, 4)), np.empty((k, 4, 6))
-    for rows, seen in outlines_seen(values, given):
+    for rows, seen, _ in outlines_seen(values, given):
         m, J = moments(seen.pixels)
         n = seen.pixels.shape[1]
         by = np.zeros((len(rows), 4, n, 2))

@@ -112,7 +112,8 @@ MOST_VERTICES = 2048
 """Of an outline in an image."""
 
 CONTOUR: dict[str, Any] = {"shape": (MOST_VERTICES, 2), "unit": "px", "ragged": True}
-"""Vertices of the outline of a lake in an image, not closed."""
+"""Vertices of the outline of a lake in an image, not closed: the shore, then islands, between which
+a row is not a number."""
 
 FRAME: dict[str, Any] = {"shape": (256, 320)}
 """An image of the camera that looks for lakes: rows, columns."""

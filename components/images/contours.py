@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+from typing import Any
+
 import numpy as np
 
 from terrafix.components.fields import CONTOUR, FRAME, LAKE_FIX, LAKE_MOMENTS, LOOK
@@ -10,7 +13,9 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import MessageInput, MessageOutput, Output
 from terrafix.models.images.coastline import coastline, gray_moments
-from terrafix.models.images.polygons import moment_noise, moments
+from terrafix.models.images.polygons import moment_noise, moments, split_rings
+
+_log = logging.getLogger(__name__)
 
 ELEMENTS = {"six": 6, "three": 3}
 """Which moments are told: all, or area and centroid alone."""
@@ -50,11 +55,12 @@ class ContourMoments(Component):
         contour, look, n, m = self.contour, self.look, self.n_members, len(LAKE_MOMENTS)
         y, R = np.zeros((n, m)), np.tile(np.eye(m), (n, 1, 1))
         good = contour.fresh & look.fresh & (look.whole > 0.5)
-        for count in np.unique(contour.count[good]):
-            rows = np.flatnonzero(good & (contour.count == count))
-            outline = contour.value[rows, :count]
-            y[rows] = moments(outline)[0]
-            R[rows], bias = moment_noise(outline, look.sigma[rows])
+        kinds = np.stack([contour.count, look.lake], axis=1)
+        for count, lake in np.unique(kinds[good], axis=0):
+            rows = np.flatnonzero(good & (kinds == [count, lake]).all(axis=1))
+            outline, starts = split_rings(contour.value[rows, : int(count)])
+            y[rows] = moments(outline, starts)[0]
+            R[rows], bias = moment_noise(outline, look.sigma[rows], starts)
             if self.unbiased:
                 y[rows] -= bias
         if self.noise == "given":
@@ -67,7 +73,8 @@ class ContourMoments(Component):
 class ImageMoments(Component):
     """Moments of a lake from an image: of the coverage of its pixels by water, as measured.
 
-    An image with no water, or with clouds at the lake's shore, makes no fix.
+    An image with no water, or with clouds at the lake's shore, makes no fix. A run of which none
+    did says why.
     """
 
     default_rate = Rate("1/30")
@@ -81,6 +88,28 @@ class ImageMoments(Component):
 
     def _initialize_impl(self) -> None:
         self.clear = np.nan
+        self._images = dict.fromkeys(("told", "dry", "hidden"), 0)
+        self._dry = ""
+
+    def _extra_state(self) -> dict[str, Any]:
+        return {**self._images, "why": self._dry}
+
+    def _set_extra_state(self, saved: dict[str, Any]) -> None:
+        self._images = {name: int(saved[name]) for name in self._images}
+        self._dry = str(saved["why"])
+
+    def terminate(self) -> None:
+        """Say why no image made a fix, if none did."""
+        super().terminate()
+        if self.step_index == 0:
+            return
+        told, dry, hidden = self._images.values()
+        if told and dry + hidden == told:
+            why = f"\n  the first without: {self._dry}" if dry else ""
+            _log.warning(
+                "'%s' made no fix of %d images: %d show no water, %d the shore behind clouds%s",
+                *(self.name, told, dry, hidden, why),
+            )
 
     def _step_impl(self, t: float, dt: float) -> None:
         n, m = self.n_members, len(LAKE_MOMENTS)
@@ -89,12 +118,16 @@ class ImageMoments(Component):
         good = np.zeros(n, dtype=np.bool_)
         for k in np.flatnonzero(told & self.environment.active):
             blur = float(self.blur[k])
+            self._images["told"] += 1
             try:
                 seen = coastline(self.image.value[k], blur=blur)
-            except ValueError:  # no water in it
+            except ValueError as error:  # no water in it
+                self._images["dry"] += 1
+                self._dry = self._dry or str(error)
                 continue
             lake = seen.rings[0]
             if not lake.whole:
+                self._images["hidden"] += 1
                 continue
             y[k], R[k], bias = gray_moments(
                 seen.coverage, seen.noise, seen.band, gain=seen.gain, blur=blur

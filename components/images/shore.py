@@ -14,9 +14,9 @@ from terrafix.components.fields import (
     SHORE_VERTICES,
     STARTS,
 )
+from terrafix.components.sensors.optics import Optics
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -26,27 +26,19 @@ from terrafix.cosim.declare.ports import (
     SharedInput,
 )
 from terrafix.models.filters.shore import SHORE_REASONS, Shore, match_shore
-from terrafix.models.geometry.earth import EARTH
 from terrafix.models.images.shore import ELEMENTS, Weights
-from terrafix.models.sensors.camera import CAMERA
 
 
-class ShoreMatcher(Component):
+class ShoreMatcher(Optics):
     """Finds what a frame shows of a lake's shore on the catalog's outline, and makes it a fix.
 
-    It needs no whole lake in the frame. What lies outside of the frame is not used, and the ends
-    of the shore, where it leaves the frame, are no shore.
+    It needs no whole lake in the frame. What lies outside of the frame is not used, nor where the
+    shore leaves it, nor islands.
     """
 
     default_rate = Rate("1/30")
 
-    focal = Parameter(unit="px", positive=True, doc="focal length of the camera")
     size = Parameter([320.0, 256.0], shape=(2,), unit="px", positive=True, doc="of the frame")
-    principal = Parameter([160.0, 128.0], shape=(2,), unit="px", doc="principal point")
-    earth_angle0 = Parameter(0.0, unit="rad", doc="inertial to Earth-fixed x axis at t = 0")
-    rotation_rate = Parameter(
-        EARTH.rotation_rate, unit="rad/s", doc="Earth rotation, as the filter knows it"
-    )
     least_sigma = Parameter(
         0.05, unit="px", positive=True, doc="of a vertex, where the contour claims less"
     )
@@ -64,6 +56,7 @@ class ShoreMatcher(Component):
     )
 
     def _initialize_impl(self) -> None:
+        self.check_pointing()
         self.reason = np.nan
         longest = int(np.diff(self.starts[: len(self.center) + 1]).max())
         if longest > SHORE_VERTICES:
@@ -100,10 +93,12 @@ class ShoreMatcher(Component):
 
     def _match(self, m: int, lake: int) -> Weights | str:
         begin, end = self.starts[lake : lake + 2]
-        contour = self.contour.value[m, : self.contour.count[m]]
+        rings = self.contour.value[m, : self.contour.count[m]]
+        separators = np.flatnonzero(np.isnan(rings[:, 0]))
+        contour = rings[: separators[0]] if separators.size else rings
         inside = ((contour > -0.5) & (contour < self.size[m] - 0.5)).all(axis=1)
         sigma = max(float(self.look.sigma[m]), float(self.least_sigma[m]))
-        given = {n: getattr(self, n)[m : m + 1] for n in CAMERA} | {"t": self.look.t[m : m + 1]}
+        given = self.looking(np.array([m])) | {"t": self.look.t[m : m + 1]}
         return match_shore(
             np.concatenate([self.prior.r[m], self.prior.v[m]]),
             self.prior.P[m],

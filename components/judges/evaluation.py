@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from terrafix.components.judges.filter_evaluation import FilterEvaluation
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.ports import Input
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
 from terrafix.models.filters.shore import shore_observation
 from terrafix.models.filters.spacecraft import STATE, sar_observation
@@ -32,6 +33,10 @@ class ShoreOrbitEvaluation(OrbitEvaluation):
 
 
 class ConsideredOrbitEvaluation(OrbitEvaluation):
-    """The same of a filter that considers the camera's misalignment and the catalog's scale."""
+    """The same of a filter that considers errors of camera and catalog, zero if not told."""
 
     error_state, observation = CONSIDERED, lake_observation(CONSIDERED)
+
+    attitude = Input((3,), unit="rad", frame="c", optional=True, doc="truth: misalignment")
+    scale = Input((1,), optional=True, doc="truth: what the catalog's outlines are too small by")
+    outline = Input((6,), unit="m", optional=True, doc="truth: of errors of vertices; not known")

@@ -1,8 +1,8 @@
 r"""A satellite's filter that knows lakes: what it estimates, and what its camera measures.
 
 State: position and velocity, inertial; where they are considered, the camera's misalignment about
-its own axes and the scale by which the catalog's outlines are too small. Gravity with the second
-zonal harmonic, white acceleration of density :math:`Q_a`.
+its own axes, the scale by which the catalog's outlines are too small, and what the catalog's
+vertices are off. Gravity with the second zonal harmonic, white acceleration of density :math:`Q_a`.
 
 Measured are the six moments of an outline in the frame: area, centroid, second central moments. A
 vertex :math:`q_k`, Earth-fixed, lies at :math:`d_k = C q_k - o` in camera axes, whose rotation
@@ -15,6 +15,11 @@ vertex :math:`q_k`, Earth-fixed, lies at :math:`d_k = C q_k - o` in camera axes,
         - \Bigl( \sum_k G_k \Bigr) \frac{\partial o}{\partial x},
 
 each factor derived symbolically.
+
+A catalog whose vertices are off, each by itself by :math:`\sigma` per axis, biases all six moments,
+constantly but for the slow change of the view, with the covariance :math:`\sigma^2 \sum_k G_k
+G_k^T`. Let :math:`L` be the Cholesky factor of the sum: the bias is :math:`L b`, and b has six
+independent elements of :math:`\sigma`. These are considered, not the vertices.
 
 References
 ----------
@@ -32,6 +37,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.filters.ensembles import Arrays, EnsembleObservation
@@ -40,9 +46,10 @@ from terrafix.models.filters.measurement import TIME
 from terrafix.models.filters.process import Process
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.images.polygons import moments
+from terrafix.models.maps.outlines import rings_of
 from terrafix.models.motion.gravity import j2_acceleration
 from terrafix.models.motion.kepler import coasted, coasting
-from terrafix.models.sensors.camera import CAMERA, STATE_SIZES, Seen
+from terrafix.models.sensors.camera import CAMERA, POINTING, STATE_SIZES, Seen
 
 COASTING = Carried(
     ("r", "v"),
@@ -60,6 +67,7 @@ CONSIDERED = ErrorState(
     *ORBIT,
     considered(vector("attitude", unit="rad", frame="c")),
     considered(vector("scale", 1)),
+    considered(vector("outline", 6, unit="m")),
     carried=COASTING,
 )
 """The same, with what the camera and the catalog do not know."""
@@ -74,8 +82,9 @@ MOMENTS = {
 }
 """Measured elements: area, centroid, second central moments of an outline in the frame."""
 
-CATALOG = ("vertices", "starts", "center")
-"""Shared arrays of a lake catalog: all vertices, where each lake's begin, the lakes' middles."""
+CATALOG = ("vertices", "starts", "center", "owner")
+"""Shared arrays of a lake catalog: all vertices, where each ring's begin, the lakes' middles, and
+which lake a ring is of; without it islands do not count."""
 
 
 def orbit_process() -> Process:
@@ -94,18 +103,21 @@ def orbit_process() -> Process:
 def state_columns(state: ErrorState) -> list[int]:
     """Columns of a derivative of `Seen` that are of the blocks of a state, in its order."""
     begins = dict(zip(STATE_SIZES, np.cumsum([0, *STATE_SIZES.values()]), strict=False))
-    return [begins[block.name] + i for block in state for i in range(block.size)]
+    seen = (block for block in state if block.name in begins)
+    return [begins[block.name] + i for block in seen for i in range(block.size)]
 
 
-def outlines_seen(values: Arrays, given: Arrays) -> Iterator[tuple[Any, Seen]]:
-    """Rows of the estimates that look at one lake, and its outline, lake by lake."""
+def outlines_seen(
+    values: Arrays, given: Arrays
+) -> Iterator[tuple[NDArray[np.intp], Seen, tuple[int, ...]]]:
+    """Rows of the estimates that look at one lake, its outline and the starts of its rings."""
     lakes = np.asarray(given["lake"]).reshape(-1).astype(np.int64)
     for lake in np.unique(lakes):
         rows = np.flatnonzero(lakes == lake)
-        begin, end = np.asarray(given["starts"][lake : lake + 2], dtype=np.int64)
+        index, starts = rings_of(int(lake), given["starts"], given.get("owner"))
         own = {n: v[rows] for n, v in values.items()}
-        told = {n: given[n][rows] for n in (*CAMERA, TIME)}
-        yield rows, Seen(own, told, given["vertices"][begin:end], given["center"][lake])
+        told = {n: given[n][rows] for n in (*CAMERA, *POINTING, TIME) if n in given}
+        yield rows, Seen(own, told, given["vertices"][index], given["center"][lake]), starts
 
 
 def lake_observation(state: ErrorState) -> EnsembleObservation:
@@ -114,6 +126,7 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
     Of blocks of `CONSIDERED`, whichever `state` has.
     """
     columns = state_columns(state)
+    off_outline = "outline" in [block.name for block in state]
 
     # both are asked of the same estimates: what they see is kept from one to the other
     kept: list[tuple[Arrays, list[Any]]] = []
@@ -122,26 +135,33 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
         last = kept[:]  # another thread may put its own there meanwhile
         if last and last[0][0] is values:
             return last[0][1]
-        looks = [(*look, *moments(look[1].pixels)) for look in outlines_seen(values, given)]
+        looks = []
+        for rows, seen, starts in outlines_seen(values, given):
+            m, J = moments(seen.pixels, starts)
+            look = {"m": m, "H": seen.derivative(J)[..., columns]}
+            if off_outline:
+                look["L"] = seen.factor(J)
+                look["m"] = m + np.einsum("kij,kj->ki", look["L"], values["outline"][rows])
+                look["H"] = np.concatenate([look["H"], look["L"]], axis=2)
+            behind = seen.depth.min(axis=1) <= 0.0
+            look["m"][behind] = np.nan
+            looks.append((rows, look))
         kept[:] = [(values, looks)]
         return looks
 
-    def predict(values: Arrays, given: Arrays) -> FloatArray:
-        found = np.empty((len(values["r"]), len(MOMENTS)))
-        for rows, _, m, _ in both(values, given):
-            found[rows] = m
-        return found
+    def told(kind: str, *shape: int) -> Any:
+        def answer(values: Arrays, given: Arrays) -> FloatArray:
+            found = np.empty((len(values["r"]), *shape))
+            for rows, look in both(values, given):
+                found[rows] = look[kind]
+            return found
 
-    def derivative(values: Arrays, given: Arrays) -> FloatArray:
-        found = np.empty((len(values["r"]), len(MOMENTS), state.size))
-        for rows, seen, _, J in both(values, given):
-            found[rows] = seen.derivative(J)[..., columns]
-        return found
+        return answer
 
     return EnsembleObservation(
-        predict,
+        told("m", len(MOMENTS)),
         MOMENTS,
-        derivative=derivative,
+        derivative=told("H", len(MOMENTS), state.size),
         fields=[vector("lake", 1)],
         parameters=CAMERA,
         shared=CATALOG,

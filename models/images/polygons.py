@@ -18,7 +18,8 @@ by Green's theorem from sums over edges [1]_, with :math:`c_k = x_k y_{k+1} - x_
     24 I_{xy} = \sum (x_k y_{k+1} + 2 x_k y_k + 2 x_{k+1} y_{k+1} + x_{k+1} y_k) c_k,
 
 relative to the first vertex, then again to the centroid: far from the origin, sums about the origin
-would cancel. All six are the same for both orientations; A is positive.
+would cancel. All six are the same for both orientations; A is positive. Of several rings the sums
+add up: islands, which run the other way round than their shore, are no part of the area.
 
 References
 ----------
@@ -28,6 +29,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,7 +80,7 @@ def outline(vertices: ArrayLike, what: str = "an outline") -> FloatArray:
     return p
 
 
-def moments(vertices: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def moments(vertices: ArrayLike, starts: Sequence[int] = (0,)) -> tuple[FloatArray, FloatArray]:
     r"""Area, centroid and central second moments, and their Jacobian.
 
     About the centroid, where :math:`S = 0`,
@@ -89,6 +91,8 @@ def moments(vertices: ArrayLike) -> tuple[FloatArray, FloatArray]:
     ----------
     vertices : array_like, shape (..., K, 2) [px]
         That they do not cross is not checked: `outline` does.
+    starts : sequence of int
+        Where the rings start: the shore with 0, then islands, which run the other way round.
 
     Returns
     -------
@@ -102,10 +106,12 @@ def moments(vertices: ArrayLike) -> tuple[FloatArray, FloatArray]:
     ValueError
         If there are fewer than three vertices, one is not finite, or nothing is enclosed.
     """
-    return _moments(vertices)[:2]
+    return _moments(vertices, starts)[:2]
 
 
-def moment_noise(vertices: ArrayLike, sigma: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def moment_noise(
+    vertices: ArrayLike, sigma: ArrayLike, starts: Sequence[int] = (0,)
+) -> tuple[FloatArray, FloatArray]:
     r"""Covariance and bias of the moments of vertices with independent noise.
 
     .. math:: P = \sigma^2 J J^T, \qquad
@@ -127,6 +133,8 @@ def moment_noise(vertices: ArrayLike, sigma: ArrayLike) -> tuple[FloatArray, Flo
     vertices : array_like, shape (..., K, 2) [px]
     sigma : array_like, shape (...)
         Standard deviation of every coordinate of every vertex [px].
+    starts : sequence of int
+        As of `moments`.
 
     Returns
     -------
@@ -144,7 +152,7 @@ def moment_noise(vertices: ArrayLike, sigma: ArrayLike) -> tuple[FloatArray, Flo
     if not (np.isfinite(variance).all() and (variance >= 0).all()):
         raise ValueError(f"the noise of vertices is 0 px or more, got {np.min(variance)}")
     variance = variance**2
-    m, J, sums = _moments(vertices)
+    m, J, sums = _moments(vertices, starts)
     flat = J.reshape(*J.shape[:-2], -1)
     P = variance[..., None, None] * flat @ flat.swapaxes(-1, -2)
     dA, dSx, dSy, *dI = np.moveaxis(sums.reshape(flat.shape), -2, 0)  # over A
@@ -177,6 +185,27 @@ class Clipped:
     def whole(self) -> bool:
         """Whether one ring is seen and none of it lies on the frame."""
         return len(self.rings) == 1 and not self.on_frame[0].any()
+
+
+def split_rings(vertices: FloatArray) -> tuple[FloatArray, tuple[int, ...]]:
+    """Vertices of rings between which a row is not a number, without these rows, and their starts.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (..., K, 2)
+        Such rows are the same for all leading axes.
+
+    Returns
+    -------
+    ndarray, shape (..., K - number of islands, 2)
+    tuple of int
+        Where the rings start.
+    """
+    first = vertices.reshape(-1, *vertices.shape[-2:])[0]
+    gaps = np.flatnonzero(np.isnan(first[:, 0]))
+    if not len(gaps):
+        return vertices, (0,)
+    return np.delete(vertices, gaps, axis=-2), (0, *(int(g) - k for k, g in enumerate(gaps)))
 
 
 def clip_to_frame(vertices: ArrayLike, width: int, height: int) -> Clipped:
@@ -292,18 +321,27 @@ def _nearest(p: FloatArray, q: FloatArray, turn: float) -> tuple[Any, ...]:
     return distance, sign * distance, np.where(corner[:, None], away, across), foot, k, t
 
 
-def _moments(vertices: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _moments(
+    vertices: ArrayLike, starts: Sequence[int] = (0,)
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Moments, their Jacobian, and derivatives of (A, S, I) about the centroid, over A."""
     p = _points(vertices, "a polygon")
-    _enough(p, "a polygon")
+    ends = [*starts[1:], p.shape[-2]]
+    for start, end in zip(starts, ends, strict=True):
+        _enough(p[..., start:end, :], "a polygon")
+    behind = ahead = None
+    if len(ends) > 1:
+        behind = np.arange(-1, p.shape[-2] - 1)
+        behind[list(starts)] = np.array(ends) - 1
+        ahead = np.argsort(behind)
     origin = p[..., :1, :]
     local = p - origin
-    area = _area(local)
+    area = _area(local, ahead)
     if (area == 0.0).any():
         raise ValueError("a polygon encloses an area, got one of 0 px^2: it has no centroid")
-    x, y, x1, y1, c = _edges(local)
+    x, y, x1, y1, c = _edges(local, ahead)
     center = np.stack([((x + x1) * c).sum(-1), ((y + y1) * c).sum(-1)], -1) / (6 * area[..., None])
-    x, y, x1, y1, c = _edges(local - center[..., None, :])
+    x, y, x1, y1, c = _edges(local - center[..., None, :], ahead)
     polynomials: tuple[
         tuple[Any, ...], ...
     ] = (  # each, and its derivatives by x, y, x1, y1; and what the sum is divided by
@@ -325,7 +363,9 @@ def _moments(vertices: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
         m[..., k] = (f * c).sum(-1) * scale
         first = np.stack([fx * c + f * y1, fy * c - f * x1], -1)
         second = np.stack([fx1 * c - f * y, fy1 * c + f * x], -1)
-        sums[..., k, :, :] = (first + np.roll(second, 1, axis=-2)) * scale[..., None, None]
+        sums[..., k, :, :] = (first + _neighbor(second, behind, 1, axis=-2)) * scale[
+            ..., None, None
+        ]
     J = sums.copy()
     J[..., 0, :, :] *= np.abs(area)[..., None, None]
     J[..., 3:, :, :] -= m[..., 3:, None, None] * sums[..., :1, :, :]
@@ -334,16 +374,23 @@ def _moments(vertices: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     return m, J, sums
 
 
-def _edges(p: FloatArray) -> tuple[FloatArray, ...]:
+def _neighbor(
+    values: FloatArray, index: NDArray[np.intp] | None, shift: int, axis: int = -1
+) -> FloatArray:
+    """Values of neighbors along the ring: rolled, or by number where there are several rings."""
+    return np.roll(values, shift, axis) if index is None else np.take(values, index, axis)
+
+
+def _edges(p: FloatArray, ahead: NDArray[np.intp] | None = None) -> tuple[FloatArray, ...]:
     """Coordinates of every edge's ends, and their cross product, each (..., K)."""
     x, y = p[..., 0], p[..., 1]
-    x1, y1 = np.roll(x, -1, axis=-1), np.roll(y, -1, axis=-1)
+    x1, y1 = _neighbor(x, ahead, -1), _neighbor(y, ahead, -1)
     return x, y, x1, y1, x * y1 - x1 * y
 
 
-def _area(p: FloatArray) -> FloatArray:
+def _area(p: FloatArray, ahead: NDArray[np.intp] | None = None) -> FloatArray:
     """Area, positive from x to y."""
-    return np.asarray(_edges(p)[4].sum(-1) / 2)
+    return np.asarray(_edges(p, ahead)[4].sum(-1) / 2)
 
 
 def _points(values: ArrayLike, what: str) -> FloatArray:

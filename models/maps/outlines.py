@@ -284,7 +284,8 @@ def _cleaned(given: ArrayLike, what: str, *, outer: bool) -> FloatArray:
     if len(np.unique(p, axis=0)) < 3:
         lines = "" if given_points < 3 else " on a line that runs out and back"
         raise ValueError(
-            f"{what} has {given_points} distinct points{lines}, and a ring has at least three"
+            f"{what} has {given_points} distinct points{lines}, and a ring has at least three\n"
+            "  leave it out, or export the lake as a polygon"
         )
     s = _vector_area(p)
     size = float(np.linalg.norm(s))
@@ -419,6 +420,31 @@ class Outline:
         p = np.where(ahead[..., None], p, self._middle)
         ring = _plane(self._vectors, self._middle)
         return np.asarray(ahead & _inside(ring, _plane(p, self._middle)))
+
+
+def rings_of(
+    lake: int, starts: NDArray[np.int64], owner: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.intp], tuple[int, ...]]:
+    """Which vertices of a catalog are those of a lake: its shore, then its islands.
+
+    Parameters
+    ----------
+    lake : int
+    starts : ndarray of int, shape (R + 1,)
+        Where rings start in the vertices, and where the last one ends; lake k's shore is ring k.
+    owner : ndarray of int, shape (R,), optional
+        Lake of each ring; without it the shore alone.
+
+    Returns
+    -------
+    ndarray of int
+    tuple of int
+        Where among them the rings start.
+    """
+    rings = [lake] if owner is None else [int(k) for k in np.flatnonzero(owner == lake)]
+    parts = [np.arange(starts[k], starts[k + 1]) for k in rings]
+    begins = np.cumsum([0, *(len(part) for part in parts[:-1])])
+    return np.concatenate(parts), tuple(int(k) for k in begins)
 
 
 def joined(parts: Sequence[Sequence[FloatArray]], what: str) -> list[list[FloatArray]]:

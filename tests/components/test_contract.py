@@ -260,7 +260,7 @@ def _components(file: Path) -> list[str]:
     bases += ("_Echo", "_Reference")
     # of a filter's own classes
     bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation", "FilterMonitor")
-    bases += ("EnsembleCorrect",)
+    bases += ("EnsembleCorrect", "Optics")
     abstract = (*bases, "FilterAcquisition", "FilterSensor", "FilterTruth")
     bases += ("LakeCorrect", "MekfPredict", "OrbitEvaluation", "OrbitPredict")
     derived = [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]

@@ -151,6 +151,8 @@ def test_what_has_no_name_in_a_file_is_not_written(tmp_path):
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.stem)
 def test_a_script_runs_and_prints_the_number_that_matters(script):
+    if "leo_lake.toml" in script.read_text() and not DATA.is_dir():
+        pytest.skip(f"no real data: {DATA} is absent (set TERRAFIX_DATA)")
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert re.search(r"\d", done.stdout)

@@ -67,3 +67,14 @@ def test_a_member_alone_sees_the_same_image(outline):
     alone = flown(outline, members=[2], duration="2")
     name = "evaluation.position_error"
     np.testing.assert_array_equal(together.dataset[name].values[:, 2], alone.dataset[name][:, 0])
+
+
+def test_images_without_water_are_said_once_with_the_first_one_s_reason(outline, caplog):
+    """Water as bright as land."""
+    result = flown(outline, ("imager.water", "0.25"), members=2, duration="2")
+    assert not result.evaluation.get("fixes")
+    (said,) = [r.getMessage() for r in caplog.records if r.name.startswith("terrafix")]
+    assert said.startswith(
+        "'moments' made no fix of 4 images: 4 show no water, 0 the shore behind clouds\n"
+        "  the first without: an image shows water, 6 standard deviations or more darker than land"
+    )

@@ -13,6 +13,7 @@ from terrafix.models.images.polygons import (
     moment_noise,
     moments,
     outline,
+    split_rings,
 )
 
 DATA = Path(os.environ.get("TERRAFIX_DATA", Path(__file__).parents[4] / "shared" / "data"))
@@ -99,6 +100,67 @@ def test_moments_take_leading_axes():
         P_one, bias_one = moment_noise(stack[k, 0], 0.1 * (k + 1))
         np.testing.assert_allclose(P[k, 0], P_one, rtol=1e-12)
         np.testing.assert_allclose(bias[k, 0], bias_one, rtol=1e-12, atol=1e-18)
+
+
+def ringed():
+    """The bay and two islands, the other way round, and where the rings start."""
+    square = np.array([[0, 0], [0, 3], [4, 3], [4, 0]], float)
+    rings = [bay(), square + np.array([92, 59]), square / 2 + np.array([120, 61])]
+    for ring in rings[1:]:
+        assert shapely.Polygon(rings[0]).contains(shapely.Polygon(ring))
+    return np.concatenate(rings), (0, len(rings[0]), len(rings[0]) + 4)
+
+
+def test_islands_are_no_part_of_the_moments():
+    """Of the sum A m: the shore's less those of the islands; shapely's area and centroid."""
+    points, starts = ringed()
+    m, _ = moments(points, starts)
+    shore, *islands = np.split(points, starts[1:])
+    polygon = shapely.Polygon(shore, islands)
+    np.testing.assert_allclose(m[0], polygon.area, rtol=1e-13)
+    np.testing.assert_allclose(m[1:3], [polygon.centroid.x, polygon.centroid.y], rtol=1e-13)
+
+    def about_origin(ring):
+        area, x, y, xx, yy, xy = moments(ring)[0]
+        return area * np.array([1, xx + x * x, yy + y * y, xy + x * y])
+
+    area, *second = about_origin(shore) - sum(about_origin(ring) for ring in islands)
+    x, y = m[1:3]
+    expected = np.array(second) / area - [x * x, y * y, x * y]
+    np.testing.assert_allclose(m[3:], expected, atol=1e-9)
+
+
+def test_derivatives_and_noise_of_rings_are_those_of_differences_and_of_draws():
+    """Jacobian by central differences; covariance and bias by 40,000 draws of 0.25 px."""
+    points, starts = ringed()
+    m, J = moments(points, starts)
+    h = 1e-5
+    for k in (0, 5, len(points) - 3):
+        for axis in (0, 1):
+            ends = []
+            for sign in (1, -1):
+                moved = points.copy()
+                moved[k, axis] += sign * h
+                ends.append(moments(moved, starts)[0])
+            np.testing.assert_allclose(J[:, k, axis], (ends[0] - ends[1]) / (2 * h), atol=1e-6)
+    draws = np.random.default_rng(1).normal(size=(40_000, *points.shape))
+    found = moments(points + 0.25 * draws, starts)[0] - m
+    P, bias = moment_noise(points, 0.25, starts)
+    spread = np.sqrt(np.diag(P))
+    np.testing.assert_allclose(found.std(axis=0), spread, rtol=0.02)
+    np.testing.assert_array_less(np.abs(found.mean(axis=0) - bias), 4.5 * spread / 200)
+    assert bias[4] > 20 * spread[4] / 200
+
+
+def test_rings_are_split_where_a_row_is_not_a_number():
+    points, starts = ringed()
+    told = np.insert(np.stack([points, points + 1]), starts[1:], np.nan, axis=1)
+    found, begins = split_rings(told)
+    assert begins == starts
+    np.testing.assert_array_equal(found, [points, points + 1])
+    alone, begins = split_rings(points)
+    assert begins == (0,)
+    assert alone is points
 
 
 @pytest.mark.parametrize("turn", [1, -1])

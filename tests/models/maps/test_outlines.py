@@ -15,6 +15,7 @@ from terrafix.models.maps.outlines import (
     crossing,
     joined,
     ring_from_degrees,
+    rings_of,
     wrapped,
 )
 
@@ -395,3 +396,13 @@ def test_parts_that_do_not_fit_are_refused():
     west = np.radians(SQUARE * [1, 0.5] - WEST)
     with pytest.raises(ValueError, match="Testsee is cut at 180 deg into parts that do not fit"):
         joined([[east], [west]], "Testsee")
+
+
+def test_rings_of_a_lake_are_its_shore_and_then_its_islands():
+    """Shores of 3, 4 and 3 vertices, then islands of 4 in lake 2, 3 in lake 0, 5 in lake 2."""
+    starts, owner = np.array([0, 3, 7, 10, 14, 17, 22]), np.array([0, 1, 2, 2, 0, 2])
+    index, begins = rings_of(2, starts, owner)
+    assert index.tolist() == [7, 8, 9, 10, 11, 12, 13, 17, 18, 19, 20, 21]
+    assert begins == (0, 3, 7)
+    index, begins = rings_of(2, starts)
+    assert (index.tolist(), begins) == ([7, 8, 9], (0,))
