@@ -360,11 +360,11 @@ def strapdown_model(earth: str = "wgs84", increments: str = "held") -> Model:
     inputs = {name: ca.SX.sym(name, 3) for name in ("delta_v_b", "delta_theta_b")}
     kept = {}
     dt = ca.SX.sym("dt")
-    used = tuple(inputs.values())
+    delta_v, delta_theta = inputs.values()
     if increments == "two-sample":
         kept = {f"earlier_{name}": ca.SX.sym(f"earlier_{name}", 3) for name in inputs}
-        used = two_sample(*used, *kept.values())
-    end = mechanized(motion, *used, dt, earth)
+        delta_v, delta_theta = two_sample(delta_v, delta_theta, *kept.values())
+    end = mechanized(motion, delta_v, delta_theta, dt, earth)
     return Model(
         f"strapdown_{earth}_{increments}".replace("-", "_"),
         inputs=inputs,
