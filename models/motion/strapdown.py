@@ -216,6 +216,15 @@ def _held_still(theta: Any, gained: Any) -> Any:
     return gained - once / 2 + a * ca.cross(theta, once)
 
 
+def at_end(delta_v_b: Any, delta_theta_b: Any) -> Any:
+    """Change of velocity by specific force (3,) [m/s], in the body axes of a step's end.
+
+    Of the integrals of specific force and rate in turning axes, both held: what `lvlh_attitude`
+    calls its increment. They differ by half of the rotation times the increment.
+    """
+    return _turning(-delta_theta_b, delta_v_b)[0]
+
+
 def two_sample(delta_v: Any, delta_theta: Any, earlier_v: Any, earlier_theta: Any) -> Any:
     r"""Increments corrected for coning and sculling by those of the step before.
 
@@ -374,4 +383,30 @@ def strapdown_model(earth: str = "wgs84", increments: str = "held") -> Model:
         initial=start._asdict(),
         outputs=motion._asdict(),
         step=dt,
+    )
+
+
+def level_view_model(earth: str = "wgs84") -> Model:
+    """Latitude, longitude, height, velocity and angles of a motion.
+
+    Parameters
+    ----------
+    earth : {"wgs84", "flat"}
+
+    Returns
+    -------
+    Model
+        Inputs ``r_e`` [m], ``v_e`` [m/s], ``q_be``; of the flat Earth the parameters ``latitude0``
+        and ``longitude0`` [rad]. Outputs as of `level_view`, ``roll``, ``pitch`` and ``heading``
+        [rad] one by one.
+    """
+    motion = Motion(ca.SX.sym("r_e", 3), ca.SX.sym("v_e", 3), ca.SX.sym("q_be", 4))
+    origin = {name: ca.SX.sym(name) for name in ("latitude0", "longitude0")}
+    view = level_view(motion, earth, tuple(origin.values()))
+    angles = dict(zip(("roll", "pitch", "heading"), ca.vertsplit(view.pop("angles")), strict=True))
+    return Model(
+        f"level_view_{earth}",
+        inputs=motion._asdict(),
+        parameters={} if rotation_rate(earth) else origin,
+        outputs=view | angles,
     )
