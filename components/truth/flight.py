@@ -49,7 +49,7 @@ class Flight(NoisyComponent):
     default_rate = Rate(hz=100)
 
     earth = Choice(
-        EARTHS, "wgs84", doc="the real one, or flat and at rest with e north, east, down"
+        EARTHS, "wgs84", doc="the real one, or flat and at rest, e north, east, down"
     )
     turbulence = Choice(TURBULENCE, "none", doc="gusts")
     segments = Rows(_SEGMENT, doc="duration or bank, turn, climb, speed of each")

@@ -37,6 +37,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from math import isfinite, radians, tan
 from typing import Any, NamedTuple
 
@@ -126,6 +127,9 @@ class Rates(NamedTuple):
     acceleration: Any
 
 
+_LEVEL = Rates(0.0, 0.0, 0.0, 0.0)
+
+
 class Planned(NamedTuple):
     """What a plan says of an instant: symbols.
 
@@ -183,11 +187,11 @@ def planned(rates: Sequence[Rates], course: Any, speed: Any, t: Any) -> Planned:
     t : SX
         [s], not negative.
     """
-    first = rates[0] if rates else Rates(0.0, 0.0, 0.0, 0.0)
+    first = rates[0] if rates else _LEVEL
     turn, climb, acceleration = (ca.SX(r) for r in first[1:])
     rising: Any = ca.SX(0)
     course, speed = course + turn * t, speed + acceleration * t
-    for now, following in zip(rates, [*rates[1:], Rates(0.0, 0.0, 0.0, 0.0)], strict=True):
+    for now, following in pairwise([*rates, _LEVEL]):
         change = [b - a for a, b in zip(now[1:], following[1:], strict=True)]
         growing, share, gone = blend(t - now.end)
         course += change[0] * gone

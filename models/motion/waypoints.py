@@ -102,8 +102,8 @@ def plan_through(waypoints: Sequence[Waypoint], earth: str) -> tuple[Start, list
         turn = remainder(legs[k][0] - legs[k - 1][0], 2 * pi)
         if abs(turn) > _SHARPEST:
             raise ValueError(
-                f"at waypoint {k + 1} the track turns by {np.degrees(turn):.0f} deg; it turns by "
-                "150 deg at most\n  put a waypoint between"
+                f"at waypoint {k + 1} the track turns by {np.degrees(abs(turn)):.0f} deg; it turns "
+                "by 150 deg at most\n  put a waypoint between"
             )
         corners.append(_corner(turn, waypoints[k].bank, speeds[k]))
     corners.append(_STRAIGHT)
