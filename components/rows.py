@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -20,12 +20,16 @@ class Rows(Setting[tuple[Row, ...]]):
     Parameters
     ----------
     columns : mapping of str to Parameter
-        Read as a parameter would be, with units. One without a default is required in each row.
+        Read as a parameter would be, with units.
+    needed : sequence of str
+        Columns that each row must have.
     """
 
-    def __init__(self, columns: Mapping[str, Parameter], *, doc: str = "") -> None:
+    def __init__(
+        self, columns: Mapping[str, Parameter], needed: Sequence[str] = (), *, doc: str = ""
+    ) -> None:
         super().__init__((), doc=doc)
-        self.columns = columns
+        self.columns, self.needed = columns, tuple(needed)
 
     def kind(self) -> str:
         """Describe what is accepted, for listings."""
@@ -58,9 +62,10 @@ class Rows(Setting[tuple[Row, ...]]):
                 raise ConfigurationError(
                     f"{where} has no '{name}'\n  {nearest(name, self.columns, what='its columns')}"
                 )
-        for name, column in self.columns.items():
-            if column.required and name not in row:
-                raise ConfigurationError(f"{where} needs '{name}': it takes {column.kind()}")
+        for name in self.needed:
+            if name not in row:
+                kind = self.columns[name].kind()
+                raise ConfigurationError(f"{where} needs '{name}': it takes {kind}")
         return {
             name: self.columns[name].read(value, where=f"{where}.{name}", bare=bare).tolist()
             for name, value in row.items()

@@ -68,6 +68,7 @@ BLEND = 4.0
 TURBULENCE = ("none", "dryden")
 """Names of the air."""
 
+_G = ca.DM([0, 0, STANDARD_GRAVITY])
 _STEEPEST = radians(75.0)
 
 
@@ -158,20 +159,17 @@ def rates_of(segments: Sequence[Segment], speed: Any) -> list[Rates]:
     found: list[Rates] = []
     now: Any = 0.0
     for segment in segments:
-        turn_rate: Any
+        duration: Any = segment.duration
         if segment.bank is not None:
-            turn_rate = np.sign(segment.turn) * STANDARD_GRAVITY * tan(segment.bank) / speed
-            duration = segment.turn / turn_rate
-        else:
-            duration = segment.duration
-            turn_rate = segment.turn / duration
+            duration = speed * abs(segment.turn) / (STANDARD_GRAVITY * tan(segment.bank))
         if not found and isinstance(duration, float) and duration < BLEND / 2:
             raise ValueError(
                 f"segment 1 lasts {duration:.3g} s; the first lasts {BLEND / 2:g} s or more"
             )
         end = speed if segment.speed is None else segment.speed
         now = now + duration
-        found.append(Rates(now, turn_rate, segment.climb / duration, (end - speed) / duration))
+        changes = (segment.turn, segment.climb, end - speed)
+        found.append(Rates(now, *(change / duration for change in changes)))
         speed = end
     return found
 
@@ -207,17 +205,16 @@ def planned(rates: Sequence[Rates], course: Any, speed: Any, t: Any) -> Planned:
     return Planned(course, v_n, a_n)
 
 
-def coordinated_axes(air_n: Any, a_n: Any) -> Any:
-    """Transformation (3, 3), level to body, of a coordinated flight without sideslip.
+def coordinated_axes(air: Any, force: Any) -> Any:
+    """Transformation (3, 3), to body axes, of a coordinated flight without sideslip.
 
     Parameters
     ----------
-    air_n, a_n : SX, shape (3,)
-        Velocity through the air [m/s] and acceleration [m/s^2] north, east, down.
+    air, force : SX, shape (3,)
+        Velocity through the air [m/s] and specific force [m/s^2], in any axes.
     """
-    x = air_n / ca.norm_2(air_n)
-    lift = ca.vertcat(a_n[0], a_n[1], a_n[2] - STANDARD_GRAVITY)
-    z = -(lift - ca.dot(lift, x) * x)
+    x = air / ca.norm_2(air)
+    z = ca.dot(force, x) * x - force
     z = z / ca.norm_2(z)
     return ca.horzcat(x, ca.cross(z, x), z).T
 
@@ -330,7 +327,7 @@ def flight_model(
     ahead, right, down = ca.vertsplit(air.off_v)
     off_n = ca.vertcat(c * ahead - s * right, s * ahead + c * right, down)
     v_e = ca.mtimes(axes.T, now.v_n + off_n)
-    level = ca.mtimes(coordinated_axes(now.v_n - wind, now.a_n), axes)
+    level = ca.mtimes(coordinated_axes(now.v_n - wind, now.a_n - _G), axes)
     turn = from_small_rotation_vector(air.off_angles)
     q_be = product(turn, from_matrix_near(level, motion.q_be))
     dv, dtheta = increments_between(motion, v_e, q_be, dt, earth)
@@ -339,7 +336,9 @@ def flight_model(
     first = planned(rates, begin.course, begin.speed, ca.SX(0))
     place = (begin.latitude, begin.longitude)
     upright = from_level(*place, begin.height, first.v_n, ca.SX.zeros(3), earth, place)
-    body = ca.mtimes(coordinated_axes(first.v_n - wind, first.a_n), level_axes(upright.r_e, earth))
+    body = ca.mtimes(
+        coordinated_axes(first.v_n - wind, first.a_n - _G), level_axes(upright.r_e, earth)
+    )
     initial = upright._asdict() | {"q_be": from_matrix(body)}
     return Model(
         f"flight_{earth}_{turbulence}",

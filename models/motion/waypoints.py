@@ -151,7 +151,7 @@ def _flatter(latitude: float) -> float:
 
 def _meridian(latitude: float) -> float:
     e2 = EARTH.flattening * (2 - EARTH.flattening)
-    return EARTH.radius * (1 - e2) / _flatter(latitude) ** 1.5
+    return EARTH.radius * (1 - e2) / sqrt(_flatter(latitude)) ** 3
 
 
 def _parallel(latitude: float, height: float) -> float:

@@ -4,7 +4,7 @@
 
 pyins 1.0.1, https://github.com/nmayorov/pyins at 8377ede. Its gravity is Somigliana's times
 1 - 2 h / a, ours the series of TR8350.2: at 1000 m they differ by 1.1e-5 m/s^2, some meters of
-height after 600 s. So its function is replaced by ours in the integrator (in its source, before it is
+height after 600 s. Its function is replaced by ours in the integrator (in its source, before it is
 compiled); nothing else is touched. Its algorithm is of low order: at 100, 200 and 400 Hz it ends
 0.30, 0.08 and 0.02 m from us, so it is asked at 400 Hz.
 """
