@@ -102,7 +102,7 @@ def inertial_process(
 
     def step(values: Values, given: Values, dt: Any, _: Any) -> dict[str, Any]:
         dv, dtheta = _unbiased(values, given, dt)
-        return mechanized(_motion(values), dv, dtheta, dt, earth)._asdict()
+        return mechanized(_motion(values), dv, dtheta, dt, earth).named
 
     def closed(values: Values, end: Values, given: Values, dt: Any) -> Any:
         kept = [ca.SX.eye(b.size) for b in state]

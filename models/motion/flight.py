@@ -275,6 +275,10 @@ def _dryden(speed: Any, dt: Any) -> _Air:
     )
 
 
+START = ("latitude", "longitude", "height", "course", "speed")
+"""Parameters that are a start."""
+
+
 def flight_model(
     segments: Sequence[Segment],
     earth: str = "wgs84",
@@ -310,9 +314,11 @@ def flight_model(
     """
     if turbulence not in TURBULENCE:
         raise ValueError(f"turbulence must be one of {TURBULENCE}, got '{turbulence}'")
-    given = Start(*(ca.SX.sym(name) for name in Start._fields))
-    parameters = {} if start is not None else given._asdict()
-    begin = given if start is None else start
+    parameters: dict[str, Any] = {}
+    begin = start
+    if begin is None:
+        parameters = {name: ca.SX.sym(name) for name in START}
+        begin = Start(**parameters)
     wind = parameters["wind_n"] = ca.SX.sym("wind_n", 3)
     t, dt = ca.SX.sym("t"), ca.SX.sym("dt")
     motion = Motion(ca.SX.sym("r_e", 3), ca.SX.sym("v_e", 3), ca.SX.sym("q_be", 4))
@@ -339,15 +345,15 @@ def flight_model(
     body = ca.mtimes(
         coordinated_axes(first.v_n - wind, first.a_n - _G), level_axes(upright.r_e, earth)
     )
-    initial = upright._asdict() | {"q_be": from_matrix(body)}
+    initial = upright.named | {"q_be": from_matrix(body)}
     return Model(
         f"flight_{earth}_{turbulence}",
-        states=motion._asdict() | increments | air.states,
+        states=motion.named | increments | air.states,
         parameters=parameters,
         noise=air.noise,
-        next=end._asdict() | {"delta_v_b": dv, "delta_theta_b": dtheta} | air.next,
+        next=end.named | {"delta_v_b": dv, "delta_theta_b": dtheta} | air.next,
         initial=initial | air.initial,
-        outputs=motion._asdict()
+        outputs=motion.named
         | increments
         | {"delta_v_end_b": at_end(**increments), "gust": air.gust},
         step=dt,

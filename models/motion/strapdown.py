@@ -100,6 +100,11 @@ class Motion(NamedTuple):
     v_e: Any
     q_be: Any
 
+    @property
+    def named(self) -> dict[str, Any]:
+        """By the names of its parts."""
+        return {"r_e": self.r_e, "v_e": self.v_e, "q_be": self.q_be}
+
 
 def rotation_rate(earth: str) -> float:
     """Rotation of an Earth about the z axis of e [rad/s].
@@ -377,11 +382,11 @@ def strapdown_model(earth: str = "wgs84", increments: str = "held") -> Model:
     return Model(
         f"strapdown_{earth}_{increments}".replace("-", "_"),
         inputs=inputs,
-        states=motion._asdict() | kept,
+        states=motion.named | kept,
         parameters=dict(zip(("r0_e", "v0_e", "q0_be"), start, strict=True)),
-        next=end._asdict() | dict(zip(kept, inputs.values(), strict=False)),
-        initial=start._asdict(),
-        outputs=motion._asdict(),
+        next=end.named | dict(zip(kept, inputs.values(), strict=False)),
+        initial=start.named,
+        outputs=motion.named,
         step=dt,
     )
 
@@ -406,7 +411,7 @@ def level_view_model(earth: str = "wgs84") -> Model:
     angles = dict(zip(("roll", "pitch", "heading"), ca.vertsplit(view.pop("angles")), strict=True))
     return Model(
         f"level_view_{earth}",
-        inputs=motion._asdict(),
+        inputs=motion.named,
         parameters={} if rotation_rate(earth) else origin,
         outputs=view | angles,
     )

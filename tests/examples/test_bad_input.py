@@ -78,9 +78,9 @@ SYSTEM_MISTAKES = {
         "ConfigurationError: 'imu' has the type 3, which is no name\n"
         "  component types: antenna_mount, attitude_sensor, contour_moments, earlier_pass, "
         "flight, fmu, fmu_loop, image_album, image_former, image_matcher, image_moments, imu, "
-        "lake_camera, lake_catalog, lake_correct, lake_correct_considered, lake_imager, last_known_orbit, "
-        "last_known_state, level_view, linear, lvlh_attitude, mekf_correct, mekf_predict, "
-        "mekf_predict_smoothed, navigation_evaluation, orbit, orbit_evaluation, "
+        "lake_camera, lake_catalog, lake_correct, lake_correct_considered, lake_imager, "
+        "last_known_orbit, last_known_state, level_view, linear, lvlh_attitude, mekf_correct, "
+        "mekf_predict, mekf_predict_smoothed, navigation_evaluation, orbit, orbit_evaluation, "
         "orbit_evaluation_considered, orbit_predict, orbit_predict_considered, "
         "recorded_attitude, recorded_echo, recorded_flight, recorded_imu, recorded_orbit, "
         "recorded_reference, reference_file, scene_echo, synthetic_sar_fix, terrain",
