@@ -104,15 +104,12 @@ def test_a_track_that_is_flown_stays_on_its_spline(write):
 def test_a_recorded_attitude_is_met_at_its_rows(write, earth, kind):
     t = np.arange(0.0, 20.0)
     angles = np.stack([10 * np.sin(t / 3), 2 * np.cos(t / 4), 350 + 3 * t], axis=-1)  # [deg]
-    if kind == "angles":
-        text = table(
-            t, *circle(t), angles, names="time,latitude,longitude,height,roll,pitch,heading"
-        )
-    else:
-        q = Rotation.from_euler("xyz", angles, degrees=True).as_quat() * [[-1], [1]] * 10
-        text = table(
-            t, *circle(t), np.tile(q, 1), names="time,latitude,longitude,height,q_x,q_y,q_z,q_w"
-        )
+    attitude, names = angles, f"{PLACE},roll,pitch,heading"
+    if kind == "quaternion":  # of either sign
+        attitude = Rotation.from_euler("xyz", angles, degrees=True).as_quat()
+        attitude[::2] *= -1
+        names = f"{PLACE},q_x,q_y,q_z,q_w"
+    text = table(t, *circle(t), attitude, names=names)
     smooth = SmoothTrack(read_track(write(text)), earth)
     found = see[earth](*smooth.at(t))[4]
     off = np.degrees(found) - angles
