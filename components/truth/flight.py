@@ -38,7 +38,7 @@ _SEGMENT = {
     "speed": Parameter(unit="m/s"),
 }
 _WAYPOINT = {
-    "at": Parameter(shape=(2,), unit="rad"),
+    "at": Parameter(shape=(2,), unit="rad", frame="geodetic"),
     "height": Parameter(unit="m"),
     "speed": Parameter(unit="m/s"),
     "bank": Parameter(unit="rad"),
