@@ -73,11 +73,15 @@ class Flight(NoisyComponent):
     gust_length = Parameter(
         533.4, shape=(3,), unit="m", positive=True, doc="scales along, right, down (dryden)"
     )
-    response_time = Parameter(1.0, unit="s", positive=True, doc="to follow the air (dryden)")
-    hold_time = Parameter(
-        30.0, unit="s", positive=True, infinite=True, doc="to fly back to the plan (dryden)"
+    wind_20ft = Parameter(
+        15.4, unit="m/s", minimum=0.0, doc="mean, 20 ft above ground; 30 kn: moderate (mil-f-8785c)"
     )
-    attitude_response = Parameter(1.0, minimum=0.0, doc="turn into gusts, 1: whole (dryden)")
+    ground = Parameter(0.0, unit="m", doc="its height under the start (mil-f-8785c)")
+    response_time = Parameter(1.0, unit="s", positive=True, doc="to follow the air (gusts)")
+    hold_time = Parameter(
+        30.0, unit="s", positive=True, infinite=True, doc="to fly back to the plan (gusts)"
+    )
+    attitude_response = Parameter(1.0, minimum=0.0, doc="turn into the air, 1: whole (gusts)")
 
     r_e = Output((3,), unit="m", frame="e", labels=XYZ, doc="position")
     v_e = Output((3,), unit="m/s", frame="e", labels=XYZ, doc="velocity relative to the Earth")

@@ -42,7 +42,7 @@ N_STATES = 5
 """Of the filters: one along, two across, two vertical. As many normal numbers make a step."""
 
 _FOOT = 0.3048
-_LOW, _MEDIUM = 1000.0, 2000.0  # [ft]
+_LOWEST, _LOW, _MEDIUM = 10.0, 1000.0, 2000.0  # [ft]
 _MEDIUM_LENGTH = 1750.0  # [ft]
 
 
@@ -103,37 +103,26 @@ def _transverse(x: Any, noise: Any, a: Any) -> Any:
     )
 
 
-def military_scales(height: float, wind: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Sigmas [m/s] and lengths [m], three each, of MIL-F-8785C at low and medium altitude.
+def military_scales(height: Any, wind: Any) -> tuple[Any, Any]:
+    """Sigmas (3,) [m/s] and lengths (3,) [m] of MIL-F-8785C at low and medium altitude.
 
     Below 1000 ft both follow from height and wind; above 2000 ft the lengths are 1750 ft, and the
-    gusts are alike, of the vertical sigma at low altitude; in between they are interpolated.
+    gusts are alike, of the vertical sigma at low altitude; in between they are interpolated. Below
+    10 ft they are those of 10 ft.
 
     Parameters
     ----------
-    height : float
-        Above ground [m], 10 ft at least.
-    wind : float
+    height : SX
+        Above ground [m].
+    wind : SX
         Mean wind at 20 ft above ground [m/s]: 15 kn light, 30 kn moderate, 45 kn severe.
-
-    Raises
-    ------
-    ValueError
-        If the height is below 10 ft, or the wind is negative.
     """
     feet = height / _FOOT
-    if not feet >= 10.0:
-        raise ValueError(f"the height must be 10 ft (3.048 m) above ground or more, got {height} m")
-    if not wind >= 0.0:
-        raise ValueError(f"the wind at 20 ft must not be negative, got {wind} m/s")
-    low = min(feet, _LOW)
+    low = ca.fmin(ca.fmax(feet, _LOWEST), _LOW)
     flatter = 0.177 + 0.000823 * low
-    share = min(max((feet - _LOW) / (_MEDIUM - _LOW), 0.0), 1.0)
+    share = ca.fmin(ca.fmax((feet - _LOW) / (_MEDIUM - _LOW), 0), 1)
     vertical = 0.1 * wind
-    horizontal = vertical / flatter**0.4
-    horizontal += share * (vertical - horizontal)
-    lengths = [
-        (length + share * (_MEDIUM_LENGTH - length)) * _FOOT
-        for length in (low / flatter**1.2, low / flatter**1.2, low)
-    ]
-    return (horizontal, horizontal, vertical), tuple(lengths)
+    horizontal = vertical * (flatter**-0.4 * (1 - share) + share)
+    lengths = ca.vertcat(low / flatter**1.2, low / flatter**1.2, low)
+    lengths += share * (_MEDIUM_LENGTH - lengths)
+    return ca.vertcat(horizontal, horizontal, vertical), _FOOT * lengths

@@ -51,7 +51,7 @@ from terrafix.models.geometry.quaternion import (
     from_small_rotation_vector,
     product,
 )
-from terrafix.models.motion.dryden import N_STATES, blown, gusts, started
+from terrafix.models.motion.dryden import N_STATES, blown, gusts, military_scales, started
 from terrafix.models.motion.gravity import STANDARD_GRAVITY
 from terrafix.models.motion.strapdown import (
     Motion,
@@ -65,8 +65,8 @@ from terrafix.models.motion.strapdown import (
 BLEND = 4.0
 """Time [s] in which rates change from one segment to the next."""
 
-TURBULENCE = ("none", "dryden")
-"""Names of the air."""
+TURBULENCE = ("none", "dryden", "mil-f-8785c")
+"""Names of the air: still, Dryden's of given scales, and of those of the specification."""
 
 _G = ca.DM([0, 0, STANDARD_GRAVITY])
 _STEEPEST = radians(75.0)
@@ -243,14 +243,18 @@ class _Air:
     parameters: dict[str, Any] = field(default_factory=dict)
 
 
-def _dryden(speed: Any, dt: Any) -> _Air:
+def _dryden(turbulence: str, height: Any, speed: Any, dt: Any) -> _Air:
     """Dryden's gusts, and how the aircraft follows them: held over a step at their mean."""
     air, noise = ca.SX.sym("air", N_STATES), ca.SX.sym("air_noise", N_STATES)
     off = {name: ca.SX.sym(name, 3) for name in ("off_p", "off_v", "off_angles")}
-    vectors = {name: ca.SX.sym(name, 3) for name in ("gust_sigma", "gust_length")}
+    if turbulence == "dryden":
+        scales = {name: ca.SX.sym(name, 3) for name in ("gust_sigma", "gust_length")}
+        sigma, length = scales.values()
+    else:
+        scales = {name: ca.SX.sym(name) for name in ("wind_20ft", "ground")}
+        sigma, length = military_scales(height - scales["ground"], scales["wind_20ft"])
     scalars = {n: ca.SX.sym(n) for n in ("response_time", "hold_time", "attitude_response")}
     tau, hold, gain = scalars.values()
-    sigma, length = vectors.values()
     after = blown(air, sigma, noise, length / speed, dt)
     left = ca.exp(-dt / tau)
     wanted = (gusts(air) + gusts(after)) / 2 - off["off_p"] / hold
@@ -271,7 +275,7 @@ def _dryden(speed: Any, dt: Any) -> _Air:
         next={"air": after} | following,
         initial={"air": started(sigma, noise)},
         noise={"air_noise": noise},
-        parameters=vectors | scalars,
+        parameters=scales | scalars,
     )
 
 
@@ -292,7 +296,8 @@ def flight_model(
     segments : sequence of Segment
         None: straight and level.
     earth : {"wgs84", "flat"}
-    turbulence : {"none", "dryden"}
+    turbulence : {"none", "dryden", "mil-f-8785c"}
+        Scales of gusts, airspeed and height are those of the start.
     start : Start, optional
         Parameters ``latitude``, ``longitude`` [rad], ``height`` [m], ``course`` [rad] and ``speed``
         [m/s] in its absence.
@@ -301,11 +306,12 @@ def flight_model(
     -------
     Model
         Parameter ``wind_n`` (3,) [m/s]; of Dryden's air ``gust_sigma`` (3,) [m/s], ``gust_length``
-        (3,) [m], ``response_time`` [s], ``hold_time`` [s], ``attitude_response``. Outputs ``r_e``
-        [m], ``v_e`` [m/s], ``q_be``; ``delta_v_b`` [m/s] and ``delta_theta_b`` [rad], the integrals
-        of specific force and inertial rate in the turning body axes; ``delta_v_end_b`` [m/s], the
-        change of velocity by specific force, in the body axes of the end; ``gust`` (3,) [m/s]
-        along, right, down. The noise of a step draws the air's start, too.
+        (3,) [m], or ``wind_20ft`` [m/s] and ``ground`` [m]; and ``response_time`` [s],
+        ``hold_time`` [s], ``attitude_response``. Outputs ``r_e`` [m], ``v_e`` [m/s], ``q_be``;
+        ``delta_v_b`` [m/s] and ``delta_theta_b`` [rad], the integrals of specific force and
+        inertial rate in the turning body axes; ``delta_v_end_b`` [m/s], the change of velocity by
+        specific force in the body axes of the end; ``gust`` (3,) [m/s] along, right, down. The
+        noise of a step draws the air's start, too.
 
     Raises
     ------
@@ -323,7 +329,9 @@ def flight_model(
     t, dt = ca.SX.sym("t"), ca.SX.sym("dt")
     motion = Motion(ca.SX.sym("r_e", 3), ca.SX.sym("v_e", 3), ca.SX.sym("q_be", 4))
     increments = {n: ca.SX.sym(n, 3) for n in ("delta_v_b", "delta_theta_b")}
-    air = _dryden(begin.speed, dt) if turbulence == "dryden" else _Air()
+    air = _Air()
+    if turbulence != "none":
+        air = _dryden(turbulence, begin.height, begin.speed, dt)
     parameters |= air.parameters
 
     rates = rates_of(segments, begin.speed)
@@ -347,7 +355,7 @@ def flight_model(
     )
     initial = upright.named | {"q_be": from_matrix(body)}
     return Model(
-        f"flight_{earth}_{turbulence}",
+        f"flight_{earth}_{turbulence}".replace("-", "_"),
         states=motion.named | increments | air.states,
         parameters=parameters,
         noise=air.noise,

@@ -144,12 +144,21 @@ def test_each_member_has_its_own_air_and_still_air_is_the_same_for_all():
         np.testing.assert_allclose(rows, calm[name], atol=1e-9)
 
 
-def test_still_air_draws_nothing():
-    made = Flight(turbulence="dryden", gust_sigma="0 m/s")
+def test_gusts_of_the_specification_are_those_of_height_above_ground_and_wind():
+    """30 kn at 1500 ft: 3 kn each, scales of 1375 ft; the first gusts of 300 members."""
+    settings = {"turbulence": "mil-f-8785c", "wind_20ft": "30 kn"}
+    above = flown(300, height="500 ft", ground="-1000 ft", record=("gust",), **settings)
+    np.testing.assert_allclose(above["gust"][0].std(axis=0), 3 * 1852 / 3600, rtol=0.13)
+    same = {"turbulence": "dryden", "gust_sigma": "3 kn", "gust_length": "1375 ft"}
+    told = flown(2, record=("gust",), **same)
+    np.testing.assert_allclose(told["gust"], above["gust"][:, :2], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("still", [("dryden", "gust_sigma"), ("mil-f-8785c", "wind_20ft")])
+def test_still_air_draws_nothing(still):
+    made = Flight(turbulence=still[0], **{still[1]: "0 m/s"})
     assert made.whole_model.noise
-    names = [n for n, p in made.settings().items() if getattr(p, "minimum", None) == 0.0]
-    zero = [n for n in names if not np.any(made.setting(n))]
-    assert not made.whole_model.without_noise_of(zero).noise
+    assert not made.whole_model.without_noise_of([still[1]]).noise
 
 
 @pytest.mark.parametrize(

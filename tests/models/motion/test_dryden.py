@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from terrafix.models.core.batch import over_members
 from terrafix.models.motion.dryden import N_STATES, blown, gusts, military_scales, started
 
 SIGMA, LENGTH, SPEED = np.array([1.5, 1.2, 0.7]), np.array([300.0, 300.0, 150.0]), 70.0
@@ -63,6 +64,9 @@ def test_spectrum_is_drydens():
     [
         # h = 500 ft, 30 kn: (0.177 + 0.4115)^0.4 = 0.8089, ^1.2 = 0.5293
         (500.0, (3.709, 3.709, 3.0), (944.7, 944.7, 500.0)),
+        # 10 ft, and below: (0.177 + 0.00823)^0.4 = 0.5093, ^1.2 = 0.1322
+        (10.0, (5.890, 5.890, 3.0), (75.64, 75.64, 10.0)),
+        (2.0, (5.890, 5.890, 3.0), (75.64, 75.64, 10.0)),
         (1000.0, (3.0, 3.0, 3.0), (1000.0, 1000.0, 1000.0)),
         (1500.0, (3.0, 3.0, 3.0), (1375.0, 1375.0, 1375.0)),
         (3000.0, (3.0, 3.0, 3.0), (1750.0, 1750.0, 1750.0)),
@@ -71,13 +75,6 @@ def test_spectrum_is_drydens():
 def test_scales_are_the_militarys(feet, sigmas, lengths):
     """In knots and feet, as the specification has them; at 1000 ft the two ranges meet."""
     knot = 1852 / 3600
-    found = military_scales(feet * 0.3048, 30 * knot)
-    np.testing.assert_allclose(np.array(found[0]) / knot, sigmas, rtol=2e-4)
-    np.testing.assert_allclose(np.array(found[1]) / 0.3048, lengths, rtol=2e-4)
-
-
-def test_scales_below_ten_feet_are_refused():
-    with pytest.raises(ValueError, match="10 ft"):
-        military_scales(2.0, 10.0)
-    with pytest.raises(ValueError, match="must not be negative"):
-        military_scales(100.0, -1.0)
+    found = over_members(military_scales, (), ())(feet * 0.3048, 30 * knot)
+    np.testing.assert_allclose(found[0] / knot, sigmas, rtol=2e-4)
+    np.testing.assert_allclose(found[1] / 0.3048, lengths, rtol=2e-4)
