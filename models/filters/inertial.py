@@ -177,13 +177,9 @@ def _spread(values: Values, end: Values, given: Values, dt: Any) -> Any:
     """Covariance (9, 9) that the white noise of the increments adds."""
     _, u = _middle(values, end, given, dt)
     accel, gyro = given["velocity_random_walk"] ** 2, given["angle_random_walk"] ** 2
-    eye, zero = ca.SX.eye(3), ca.SX(3, 3)
-    rv, vt = dt * dt / 2 * accel * eye, -dt / 2 * gyro * u
-    vv = dt * (accel * eye + gyro / 3 * ca.mtimes(u, u.T))
-    return ca.blockcat(
-        [
-            [dt**3 / 3 * accel * eye, rv, zero],
-            [rv, vv, vt],
-            [zero, vt.T, dt * gyro * eye],
-        ]
-    )
+    eye, squared = ca.SX.eye(3), gyro * ca.mtimes(u, u.T)
+    rr = dt**3 * (accel / 3 * eye + squared / 20)
+    rv = dt**2 * (accel / 2 * eye + squared / 8)
+    vv = dt * (accel * eye + squared / 3)
+    rt, vt = -dt * dt / 6 * gyro * u, -dt / 2 * gyro * u
+    return ca.blockcat([[rr, rv, rt], [rv, vv, vt], [rt.T, vt.T, dt * gyro * eye]])

@@ -23,7 +23,7 @@ GIVEN = {
     "delta_v_b": np.array([0.03, 0.01, -0.098]),  # [m/s] in 10 ms
     "delta_theta_b": np.array([2e-4, 5e-4, 1e-3]),  # [rad]
     "velocity_random_walk": 1e-3,
-    "angle_random_walk": 2e-5,
+    "angle_random_walk": 2e-3,  # coarse, so that it shows in velocity within a step
     "accel_time": 300.0,
     "accel_sigma": 3e-3,
     "gyro_time": 200.0,
@@ -109,6 +109,7 @@ def test_the_transition_is_the_exponential_of_the_printed_equations(earth, trans
             np.testing.assert_allclose(
                 blocks(phi)[name],
                 block,
+                rtol=0,
                 atol=share * np.abs(block).max() + 1e-12,
                 err_msg=str(name),
             )
@@ -116,22 +117,22 @@ def test_the_transition_is_the_exponential_of_the_printed_equations(earth, trans
 
 @pytest.mark.parametrize("earth", EARTHS)
 def test_the_noise_is_van_loans(earth):
-    """Where a step is 1 percent of what the biases' noise needs to reach velocity and attitude."""
+    """To 2e-3 of the sigmas, but for what the biases' noise of a step does within that step."""
     at = start(earth)
     A, noise = typed(earth, at)
     n = len(A)
     big = expm(np.block([[-A, noise], [np.zeros((n, n)), A.T]]) * DT)
     expected = big[n:, n:].T @ big[:n, n:]
     Q = built(earth)(at)[2]
-    np.testing.assert_allclose(Q, Q.T, atol=1e-30)
+    np.testing.assert_allclose(Q, Q.T, rtol=0, atol=1e-30)
     assert np.linalg.eigvalsh(Q / np.sqrt(np.outer(np.diag(Q), np.diag(Q)))).min() > -1e-14
     driven = {("accel_bias_b", "r_e"), ("accel_bias_b", "v_e"), ("gyro_bias_b", "q_be")}
-    driven |= {("gyro_bias_b", "v_e"), ("gyro_bias_b", "r_e"), ("q_be", "r_e")}
+    driven |= {("gyro_bias_b", "v_e"), ("gyro_bias_b", "r_e")}
     sigma = np.sqrt(np.diag(expected))
     for name, block in blocks(expected / np.outer(sigma, sigma)).items():
         if name not in driven and name[::-1] not in driven:
             found = blocks(Q / np.outer(sigma, sigma))[name]
-            np.testing.assert_allclose(found, block, atol=2e-3, err_msg=str(name))
+            np.testing.assert_allclose(found, block, rtol=0, atol=2e-3, err_msg=str(name))
 
 
 @pytest.mark.parametrize("earth", EARTHS)
@@ -163,7 +164,9 @@ def test_small_errors_grow_as_the_transition_says(earth, transition):
     found = apart(np.concatenate([*truth.values()]), np.concatenate([*estimate.values()]))
     for place in PLACES.values():
         size = np.abs(error[place]).max()
-        np.testing.assert_allclose(found.full().ravel()[place], error[place], atol=2e-3 * size)
+        np.testing.assert_allclose(
+            found.full().ravel()[place], error[place], rtol=0, atol=2e-3 * size
+        )
 
 
 def test_a_state_that_begins_otherwise_is_refused():

@@ -112,7 +112,19 @@ def test_a_plan_changes_what_it_says(earth):
         assert np.degrees(course[k] - START.course) == pytest.approx(turned, abs=1e-6)
         assert flown["height"][k] - START.height == pytest.approx(climbed, abs=2e-4)
         assert speed[k] == pytest.approx(fast, abs=1e-6)
-        np.testing.assert_allclose(flown["angles"][k, 0], 0.0, atol=1e-6)
+        np.testing.assert_allclose(flown["angles"][k, 0], 0.0, rtol=0, atol=1e-6)
+
+
+def test_a_plan_accelerates_as_its_velocity_changes():
+    """The acceleration that banks and pitches the aircraft is the derivative of its velocity."""
+    t = ca.SX.sym("t")
+    plan = (Segment(5.0), Segment(6.0, turn=0.5, climb=20.0, speed=75.0), Segment(5.0, climb=-9.0))
+    said = planned(rates_of(plan, 70.0), 0.5, 70.0, t)
+    both = ca.Function("a", [t], [said.a_n, ca.jacobian(said.v_n, t)])
+    for at in np.linspace(0.1, 19.9, 67):
+        told, derived = (a.full() for a in both(at))
+        np.testing.assert_allclose(told, derived, rtol=0, atol=1e-12)
+    assert np.abs(both(11.0)[0].full()).min() > 0.5  # it climbs, turns and slows down there
 
 
 def test_a_flight_is_its_plan_to_the_error_of_the_trapezoidal_rule():
@@ -124,8 +136,8 @@ def test_a_flight_is_its_plan_to_the_error_of_the_trapezoidal_rule():
     fine = np.arange(10 * n + 1) * DT / 10
     v = velocity(fine[None]).full().T
     whole = (v[:-1] + v[1:]).sum(axis=0) * DT / 20
-    np.testing.assert_allclose(flown["r_e"][-1] - flown["r_e"][0], whole, atol=3e-5)
-    np.testing.assert_allclose(flown["v_e"][-1], v[-1], atol=1e-12)
+    np.testing.assert_allclose(flown["r_e"][-1] - flown["r_e"][0], whole, rtol=0, atol=3e-5)
+    np.testing.assert_allclose(flown["v_e"][-1], v[-1], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("earth", EARTHS)
@@ -148,8 +160,10 @@ def test_wind_turns_the_nose_and_not_the_course():
     wind = across * np.array([-s, c, 0.0])
     flown = view(fly(flight_model([], "wgs84", "none", START), 500, wind_n=wind), "wgs84")
     course = np.arctan2(flown["v_n"][:, 1], flown["v_n"][:, 0])
-    np.testing.assert_allclose(course, START.course, atol=1e-9)
-    np.testing.assert_allclose(flown["angles"][:, 2], START.course - np.radians(5.0), atol=1e-7)
+    np.testing.assert_allclose(course, START.course, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        flown["angles"][:, 2], START.course - np.radians(5.0), rtol=0, atol=1e-7
+    )
 
 
 def test_the_change_of_velocity_at_the_end_is_turned_by_the_step():
@@ -165,7 +179,7 @@ def test_the_change_of_velocity_at_the_end_is_turned_by_the_step():
     found = outputs(flown["delta_v_b"][1:][k].T, flown["delta_theta_b"][1:][k].T).full().T
     change = np.diff(flown["v_e"], axis=0) - [0, 0, STANDARD_GRAVITY * DT]
     C_be = rotation_matrix_array(flown["q_be"][1:])
-    np.testing.assert_allclose(found, np.einsum("nij,nj->ni", C_be, change)[k], atol=1e-13)
+    np.testing.assert_allclose(found, np.einsum("nij,nj->ni", C_be, change)[k], rtol=0, atol=1e-13)
     assert np.abs(found - flown["delta_v_b"][1:][k]).max() > 1e-5
 
 
@@ -306,6 +320,43 @@ def test_the_aircraft_follows_the_air_as_a_lag():
     np.testing.assert_allclose(np.diag(P)[8:11], expected, rtol=2e-4)
 
 
+def test_gusts_along_the_course_leave_the_others_alone():
+    """With gusts ahead only, velocity keeps its direction on a course of 0.5 rad."""
+    only = AIR | {"gust_sigma": np.array([2.0, 0.0, 0.0])}
+    noise = np.random.default_rng(1).standard_normal((1001, 5))
+    flown = fly(flight_model([], "flat", "dryden", START), 1000, noise=noise, **CALM, **only)
+    along = [np.cos(START.course), np.sin(START.course), 0.0]
+    right = [-np.sin(START.course), np.cos(START.course), 0.0]
+    assert np.ptp(flown["v_e"] @ along) > 0.1
+    np.testing.assert_allclose(flown["v_e"] @ right, 0.0, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(flown["v_e"][:, 2], 0.0, rtol=0, atol=1e-11)
+
+
+def test_a_deviation_dies_out_as_a_lag():
+    """In still air without a pilot: v exp(-t / tau), and the place has gained tau v (1 - exp)."""
+    model = flight_model([], "flat", "dryden", START)
+    still = AIR | {"hold_time": 1e15, "gust_sigma": np.zeros(3), "response_time": 2.0}
+    given = [model.parameters[k] for k in still]
+    after = [model.next["off_p"], model.next["off_v"]]
+    step = ca.Function(
+        "s",
+        [model.states["off_v"], *given, model.step],
+        [
+            ca.substitute(
+                a,
+                ca.vertcat(model.states["air"], model.states["off_p"], model.noise["air_noise"]),
+                ca.SX.zeros(13),
+            )
+            for a in after
+        ],
+    )
+    v = np.array([1.0, -2.0, 3.0])
+    place, speed = (r.full().ravel() for r in step(v, *still.values(), 0.5))
+    left = np.exp(-0.5 / 2.0)
+    np.testing.assert_allclose(speed, left * v, rtol=1e-14)
+    np.testing.assert_allclose(place, 2.0 * (1 - left) * v, rtol=1e-13)
+
+
 def test_a_pilot_holds_the_track():
     """The displacement stays below s sqrt(2 T h): a lag of the hold time on slow air."""
     model = flight_model([], "flat", "dryden", START)
@@ -322,6 +373,15 @@ def test_the_nose_turns_into_gusts_by_some_milliradians():
     model = flight_model([], "flat", "dryden", START)
     sigma = np.sqrt(np.diag(covariance(model, 17, **AIR))[11:14])
     assert np.all((sigma > 2e-3) & (sigma < 2e-2))
+    # a gust from the left rolls to the right and yaws to the left, one from above pitches up
+    P = covariance(model, 17, **AIR)
+    gust = ca.Function(
+        "g", [model.states["air"]], [ca.jacobian(model.outputs["gust"], model.states["air"])]
+    )
+    with_angles = gust(np.zeros(5)).full() @ P[:5, 11:14]
+    assert with_angles[1, 0] > 0
+    assert with_angles[2, 1] > 0
+    assert with_angles[1, 2] < 0
     still = covariance(model, 17, **(AIR | {"attitude_response": 0.0}))
     np.testing.assert_array_equal(still[11:14, 11:14], 0.0)
 

@@ -64,12 +64,12 @@ def test_a_circle_is_flown_with_the_bank_of_its_turn(write, earth):
     smooth = SmoothTrack(read_track(write(table(t, *circle(t)))), earth)
     motion = smooth.at(np.array([20.25, 40.5]))
     _, _, height, v_n, angles = see[earth](*motion)
-    np.testing.assert_allclose(height, 800.0, atol=0.05)
+    np.testing.assert_allclose(height, 800.0, rtol=0, atol=0.05)
     np.testing.assert_allclose(np.linalg.norm(v_n, axis=1), SPEED, rtol=2e-3)
     bank = np.arctan(SPEED * RATE / STANDARD_GRAVITY)
     np.testing.assert_allclose(angles[:, 0], bank, rtol=5e-3)
-    np.testing.assert_allclose(angles[:, 1], 0.0, atol=1e-3)
-    np.testing.assert_allclose(angles[:, 2], [RATE * 20.25, RATE * 40.5], atol=3e-3)
+    np.testing.assert_allclose(angles[:, 1], 0.0, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(angles[:, 2], [RATE * 20.25, RATE * 40.5], rtol=0, atol=3e-3)
 
 
 def test_the_spline_is_of_sixth_order(write):
@@ -87,14 +87,19 @@ def test_the_spline_is_of_sixth_order(write):
 
 
 def test_a_track_that_is_flown_stays_on_its_spline(write):
-    """By the trapezoidal rule, h^2 / 12 times the change of acceleration: 3e-5 m at 100 Hz."""
+    """By the trapezoidal rule, h^2 / 12 times the change of acceleration: 3e-5 m at 100 Hz.
+
+    Its force has no part to the side, Coriolis' (6e-3 m/s^2) included.
+    """
     t = np.arange(0.0, 31.0)
     smooth = SmoothTrack(read_track(write(table(t, *circle(t)))))
     n, dt = 3000, 0.01
     wanted = smooth.at(dt * np.arange(n + 1))
     r, v, q = wanted.r_e[0], wanted.v_e[0], wanted.q_be[0]
     for k in range(n):
-        r, v, q, *_ = follow_array["wgs84"](r, v, q, wanted.v_e[k + 1], wanted.q_be[k + 1], dt)
+        r, v, q, dv, *_ = follow_array["wgs84"](r, v, q, wanted.v_e[k + 1], wanted.q_be[k + 1], dt)
+        if 500 < k < 2500:
+            assert abs(dv[1]) < 1e-3 * dt
     assert np.linalg.norm(r - wanted.r_e[-1]) < 3e-5
     assert angle_between_array(q, wanted.q_be[-1]) < 1e-12
 
@@ -113,7 +118,7 @@ def test_a_recorded_attitude_is_met_at_its_rows(write, earth, kind):
     smooth = SmoothTrack(read_track(write(text)), earth)
     found = see[earth](*smooth.at(t))[4]
     off = np.degrees(found) - angles
-    np.testing.assert_allclose((off + 180) % 360 - 180, 0.0, atol=1e-8)
+    np.testing.assert_allclose((off + 180) % 360 - 180, 0.0, rtol=0, atol=1e-8)
 
 
 def test_noise_of_places_is_smoothed_out(write):
@@ -136,7 +141,9 @@ def test_noise_of_places_is_smoothed_out(write):
     assert np.sqrt(np.mean(error**2)) < 0.6 * sigma
     residual = np.linalg.norm(smooth.at(t).r_e - through.at(t).r_e) / np.sqrt(3 * len(t))
     assert residual == pytest.approx(sigma, rel=0.15)
-    np.testing.assert_allclose(np.linalg.norm(smooth.at(t).v_e[inner], axis=1), SPEED, atol=3.0)
+    np.testing.assert_allclose(
+        np.linalg.norm(smooth.at(t).v_e[inner], axis=1), SPEED, rtol=0, atol=3.0
+    )
 
 
 GOOD = [[float(t), 47.0 + 5e-4 * t, 8.0, 500.0] for t in range(12)]
