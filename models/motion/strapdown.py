@@ -36,7 +36,7 @@ the body axes of the step's start,
 That is carried in inertial axes which coincide with e at the start of the step, with the
 gravitation of its middle, and turned to the e axes of its end. So a trajectory of held rates and
 forces is reproduced to rounding, apart from the change of gravitation within a step
-(:math:`\dot g\, \Delta t^3 / 12`, 4e-6 m after 600 s at 100 Hz and 70 m/s).
+(:math:`\dot g\, \Delta t^3 / 12`): 8e-6 m after 600 s with turns at 100 Hz, against 1 kHz.
 
 Where rate and force move within a step, `two_sample` corrects its increments by those of the step
 before (coning, sculling), as if both were linear over the two [1]_, [2]_.
@@ -61,12 +61,13 @@ import casadi as ca
 from terrafix.models.core.batch import over_members
 from terrafix.models.core.model import Model
 from terrafix.models.geometry.earth import EARTH
-from terrafix.models.geometry.frames import earth_rate_cross, rotate_about_pole
+from terrafix.models.geometry.frames import earth_rate_cross
 from terrafix.models.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef, north_east_down
 from terrafix.models.geometry.quaternion import (
     from_matrix,
     from_rotation_vector,
     inverse,
+    normalized,
     product,
     rotation_matrix,
     rotation_vector,
@@ -152,11 +153,12 @@ def mechanized(motion: Motion, delta_v_b: Any, delta_theta_b: Any, dt: Any, eart
     gained, moved = _turning(delta_theta_b, delta_v_b)
     v_i, g = _inertial(motion, dt, earth)
     r_i = motion.r_e + dt * (v_i + ca.mtimes(C_eb, moved) + dt / 2 * g)
-    r_e = rotate_about_pole(rate * dt, r_i)
-    v_e = rotate_about_pole(rate * dt, v_i + ca.mtimes(C_eb, gained) + dt * g)
+    r_e = _turned_about_pole(rate * dt, r_i)
+    v_e = _turned_about_pole(rate * dt, v_i + ca.mtimes(C_eb, gained) + dt * g)
     turn = from_rotation_vector(delta_theta_b)
     q_be = product(product(turn, motion.q_be), inverse(_earth_turn(rate, dt)))
-    return Motion(r_e, v_e - earth_rate_cross(rate, r_e), q_be)
+    # rounding that is the same in every step would let the length drift, and the force with it
+    return Motion(r_e, v_e - earth_rate_cross(rate, r_e), normalized(q_be))
 
 
 def increments_between(motion: Motion, v_e: Any, q_be: Any, dt: Any, earth: str) -> Any:
@@ -173,8 +175,8 @@ def increments_between(motion: Motion, v_e: Any, q_be: Any, dt: Any, earth: str)
     turn = product(product(q_be, _earth_turn(rate, dt)), inverse(motion.q_be))
     theta = rotation_vector(turn)
     v_i, g = _inertial(motion, dt, earth)
-    r_e = rotate_about_pole(rate * dt, motion.r_e + dt * v_i)
-    end_i = rotate_about_pole(-rate * dt, v_e + earth_rate_cross(rate, r_e))
+    r_e = _turned_about_pole(rate * dt, motion.r_e + dt * v_i)
+    end_i = _turned_about_pole(-rate * dt, v_e + earth_rate_cross(rate, r_e))
     gained = ca.mtimes(rotation_matrix(motion.q_be), end_i - v_i - dt * g)
     return _held_still(theta, gained), theta
 
@@ -186,6 +188,17 @@ def _inertial(motion: Motion, dt: Any, earth: str) -> tuple[Any, Any]:
     middle = motion.r_e + dt / 2 * v_i
     outward = earth_rate_cross(rate, earth_rate_cross(rate, middle))
     return v_i, gravity(middle, earth) + outward
+
+
+def _turned_about_pole(angle: Any, vector: Any) -> Any:
+    """Components (3,) in axes turned by a small angle [rad] about the polar axis.
+
+    What the turn changes is added: a cosine near one is rounded alike in every step, which after
+    ten minutes at 1 kHz is 0.2 mm of position.
+    """
+    s, k = ca.sin(angle), 2 * ca.sin(angle / 2) ** 2
+    x, y, z = vector[0], vector[1], vector[2]
+    return ca.vertcat(x + (s * y - k * x), y - (s * x + k * y), z)
 
 
 def _earth_turn(rate: float, dt: Any) -> Any:

@@ -92,6 +92,20 @@ def test_increments_lead_to_the_truth_after_ten_minutes(earth, n):
     assert angle_between_array(told["q_be"], truth["q_be"]).max() < 1e-11
 
 
+def test_held_increments_may_be_told_in_parts():
+    """At 1 kHz a tenth each, for 120 s: gravitation within a step, and no drift by rounding."""
+    n = 12000
+    truth = fly(flight_model(TOUR, "wgs84", "none", START), n, **CALM)
+    start = np.concatenate([truth[k][0] for k in ("r_e", "v_e", "q_be")])
+    inputs = np.hstack([truth["delta_v_b"][1:], truth["delta_theta_b"][1:]])
+    zeros = {"r0_e": np.zeros(3), "v0_e": np.zeros(3), "q0_be": np.zeros(4)}
+    tenths = np.repeat(inputs / 10, 10, axis=0)
+    told = fly(strapdown_model("wgs84"), 10 * n, DT / 10, start=start, inputs=tenths, **zeros)
+    assert np.abs(told["r_e"][-1] - truth["r_e"][-1]).max() < 2e-6
+    assert np.abs(told["v_e"][-1] - truth["v_e"][-1]).max() < 2e-9
+    np.testing.assert_allclose(np.linalg.norm(told["q_be"], axis=1), 1, rtol=0, atol=1e-15)
+
+
 @pytest.mark.parametrize("earth", EARTHS)
 def test_a_plan_changes_what_it_says(earth):
     """Course, height and speed after each segment, to rounding."""
@@ -320,16 +334,18 @@ def test_the_aircraft_follows_the_air_as_a_lag():
     np.testing.assert_allclose(np.diag(P)[8:11], expected, rtol=2e-4)
 
 
-def test_gusts_along_the_course_leave_the_others_alone():
-    """With gusts ahead only, velocity keeps its direction on a course of 0.5 rad."""
-    only = AIR | {"gust_sigma": np.array([2.0, 0.0, 0.0])}
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_gust_moves_the_aircraft_in_its_own_direction(axis):
+    """Along a course of 0.5 rad, to its right, or down: the other two stay as planned."""
+    only = AIR | {"gust_sigma": 2.0 * (np.arange(3) == axis)}
     noise = np.random.default_rng(1).standard_normal((1001, 5))
     flown = fly(flight_model([], "flat", "dryden", START), 1000, noise=noise, **CALM, **only)
-    along = [np.cos(START.course), np.sin(START.course), 0.0]
-    right = [-np.sin(START.course), np.cos(START.course), 0.0]
-    assert np.ptp(flown["v_e"] @ along) > 0.1
-    np.testing.assert_allclose(flown["v_e"] @ right, 0.0, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(flown["v_e"][:, 2], 0.0, rtol=0, atol=1e-11)
+    c, s = np.cos(START.course), np.sin(START.course)
+    axes = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    off = (flown["v_e"] - flown["v_e"][0]) @ axes.T
+    np.testing.assert_allclose(off[:, axis], flown["off_v"][:, axis], rtol=0, atol=1e-11)
+    assert np.ptp(off[:, axis]) > 0.1
+    np.testing.assert_allclose(np.delete(off, axis, axis=1), 0.0, rtol=0, atol=1e-11)
 
 
 def test_a_deviation_dies_out_as_a_lag():
