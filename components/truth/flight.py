@@ -21,7 +21,7 @@ from terrafix.cosim.declare.parameters import Choice, FilePath, Parameter
 from terrafix.cosim.declare.ports import Input, Output, State
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
-from terrafix.models.motion.flight import TURBULENCE, Segment, flight_model, rates_of
+from terrafix.models.motion.flight import TURBULENCE, Segment, Start, flight_model, rates_of
 from terrafix.models.motion.strapdown import EARTHS, Motion, level_view_model
 from terrafix.models.motion.track import SmoothTrack, follow_array, read_track
 from terrafix.models.motion.waypoints import Waypoint, plan_through
@@ -103,23 +103,28 @@ class Flight(NoisyComponent):
 
     def validate(self) -> None:
         """Look whether the plan can be flown."""
-        super().validate()
         if self.setting("segments") and self.setting("waypoints"):
             raise ConfigurationError(
                 f"'{self.name}' has segments and waypoints\n  give it one of them"
             )
         try:
-            rates_of(self._segments(), float(self.setting("speed")))
+            _, segments = self._plan()
+            rates_of(segments, float(self.setting("speed")))
         except ValueError as error:
             raise ConfigurationError(f"'{self.name}' cannot fly its plan: {error}") from error
+        super().validate()
 
     def build_model(self) -> Model:
         """Build the model for the chosen Earth, air and plan."""
-        segments, start = self._segments(), None
-        if self.setting("waypoints"):
-            points = [_waypoint(row) for row in self.setting("waypoints")]
-            start, segments = plan_through(points, self.setting("earth"))
+        start, segments = self._plan()
         return flight_model(segments, self.setting("earth"), self.setting("turbulence"), start)
+
+    def _plan(self) -> tuple[Start | None, list[Segment]]:
+        """Where waypoints say it the start, and what is flown from there."""
+        if not self.setting("waypoints"):
+            return None, self._segments()
+        points = [_waypoint(row) for row in self.setting("waypoints")]
+        return plan_through(points, self.setting("earth"))
 
     def _segments(self) -> list[Segment]:
         found = []
