@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.stats import chi2
 
 from terrafix.models.core.batch import over_members
 from terrafix.models.filters.error_state import ErrorState, rotation, vector
@@ -177,3 +178,58 @@ def test_a_state_that_begins_otherwise_is_refused():
         inertial_process(STATE, transition="exact")
     with pytest.raises(ValueError, match="earth must be one of"):
         inertial_process(STATE, "round")
+
+
+@pytest.mark.parametrize("earth", EARTHS)
+def test_drift_is_as_large_as_its_covariance_says(earth):
+    """Increments with noise and biases, 100 members, 6 s: NEES of 15 within 99.9 percent."""
+    n, members, dt = 150, 100, 0.04
+    state = ErrorState(*INERTIAL)
+    parameters = {"velocity_random_walk": 1e-2, "angle_random_walk": 1e-4, "t": 30.0}
+    sigmas = {"accel_bias_b": 0.02, "gyro_bias_b": 1e-4}
+    P0 = np.diag(np.repeat([3.0, 0.1, 1e-3, 0.02, 1e-4], 3) ** 2)
+    inputs = {k: ca.SX.sym(k, 3) for k in ("delta_v_b", "delta_theta_b")}
+    x = {b.name: ca.SX.sym(b.name, b.value_size) for b in state}
+    P = ca.SX.sym("P", 15, 15)
+    process = inertial_process(
+        state, earth, decays={name: ("t", f"{name}_sigma") for name in sigmas}
+    )
+    given = inputs | parameters | {f"{k}_sigma": v for k, v in sigmas.items()}
+    moved = propagate(state, process, x, given, dt, 0.0)
+    ends = [moved.values[k] for k in x]
+    step = ca.Function("step", [*x.values(), P, *inputs.values()], [*ends, moved.covariance(P)])
+    e, y = ca.SX.sym("e", 15), {k: ca.SX.sym(f"{k}_y", s.numel()) for k, s in x.items()}
+    retract = ca.Function("r", [*x.values(), e], [*state.retract(x, e).values()])
+    apart = ca.Function("d", [*y.values(), *x.values()], [state.difference(y, x)])
+
+    rng = np.random.default_rng(17)
+    at = start(earth)
+    truth = [np.tile(at[k][:, None], members) for k in x]
+    error = np.sqrt(np.diag(P0))[:, None] * rng.standard_normal((15, members))
+    flown = [r.full() for r in retract.map(members)(*truth, -error)]
+    # the biases of the truth are walked here, and begin where they are drawn
+    biases = [truth[3], truth[4]]
+    P = np.tile(P0, members)
+    ideal = {k: np.tile(dt / DT * GIVEN[k][:, None], members) for k in inputs}
+    quiet = [np.zeros((3, members))] * 2
+    for _ in range(n):
+        truth = [r.full() for r in step.map(members)(*truth[:3], *quiet, P, *ideal.values())[:3]]
+        noisy = []
+        for k, (name, walk) in enumerate(
+            zip(inputs, ("velocity_random_walk", "angle_random_walk"), strict=True)
+        ):
+            white = parameters[walk] * np.sqrt(dt) * rng.standard_normal((3, members))
+            noisy.append(ideal[name] + dt * biases[k] + white)
+        *flown, P = (r.full() for r in step.map(members)(*flown, P, *noisy))
+        kept = np.exp(-dt / parameters["t"])
+        biases = [
+            kept * b + s * np.sqrt(1 - kept**2) * rng.standard_normal((3, members))
+            for b, s in zip(biases, sigmas.values(), strict=True)
+        ]
+    off = apart.map(members)(*truth, *biases, *flown).full().T
+    each = P.reshape(15, members, 15).transpose(1, 0, 2)
+    nees = np.einsum("mi,mij,mj->m", off, np.linalg.inv(each), off)
+    low, high = chi2.ppf([5e-4, 1 - 5e-4], 15 * members) / members
+    assert low < nees.mean() < high
+    ratio = off.std(axis=0) / np.sqrt(np.diagonal(each, axis1=1, axis2=2)).mean(axis=0)
+    assert np.all(np.abs(ratio - 1) < 0.28)  # four standard errors of a sigma
