@@ -259,7 +259,7 @@ def shore_observation(state: ErrorState) -> EnsembleObservation:
     columns = state_columns(state)
 
     def each_lake(values: Arrays, given: Arrays) -> Iterator[tuple[Any, Seen, FloatArray]]:
-        shores = {**given, "owner": None}  # islands are not matched
+        shores = {name: told for name, told in given.items() if name != "owner"}
         for rows, seen, _ in outlines_seen(values, shores):
             W = given["weights"][rows].reshape(-1, ELEMENTS, MOST_VERTICES, 2)
             yield rows, seen, W[:, :, : seen.pixels.shape[1]]
