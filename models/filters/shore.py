@@ -42,6 +42,8 @@ SHORE_REASONS = ("", "too little shore", "not found", "more than one place")
 _STEPS = 12
 _STILL = 0.05
 """Movement of the outline at which the correspondence is kept [px]."""
+_KNOWN = 0.2
+"""Uncertainty of the outline up to which the prior's correspondence is taken [px]."""
 _NARROW = 12.0
 """Uncertainty of the outline up to which its shore is found along normals [px]."""
 _LEAST, _LEAST_SEARCHED = 24, 80
@@ -131,8 +133,12 @@ def match_shore(
         return "too little shore"
     if (seen.depth <= 0).any():
         return "not found"
-    information: FloatArray = np.linalg.inv(P0).astype(np.float64)
     spread = _spread(seen, P0)
+    if spread.max() < _KNOWN:  # the shores correspond as they are
+        reach = 4 * spread.max() + 4 * shore.sigma + _CATALOG
+        fit = _judged(seen, crossings(seen.pixels[0], shore.contour, shore.shown, reach), shore)
+        return fit if isinstance(fit, str) else fit.match
+    information: FloatArray = np.linalg.inv(P0).astype(np.float64)
     if spread.max() < _NARROW:
         fit = _fit(look, x0, x0, information, shore, 4 * spread.max() + 4 * shore.sigma)
         return fit if isinstance(fit, str) else fit.match
@@ -219,7 +225,7 @@ def _fit(
         step = np.linalg.solve(information + H.T @ H, H.T @ residual - information @ (x - x0))
         moved = np.abs(_moved(seen, step)).max()
         if moved < _STILL and reach <= 2 * close:
-            return _judged(outline, found, told, shore)
+            return _judged(seen, found, shore)
         x = x + step
         reach = max(close, min(reach, 3 * moved + close)) if moved < reach else reach
     return "not found"
@@ -235,14 +241,17 @@ def _moved(seen: Seen, step: FloatArray) -> FloatArray:
     return seen.derivative(by)[0, :, :6] @ step
 
 
-def _judged(outline: FloatArray, found: Crossings, told: Weights, shore: Shore) -> _Fit | str:
+def _judged(seen: Seen, found: Crossings, shore: Shore) -> _Fit | str:
     """A match, if most of the shore that was seen is matched, and closely."""
+    outline = seen.pixels[0]
+    if len(found.edge) < _LEAST:
+        return "not found"
     cost = float(np.mean(found.distance**2))
     alike = min(1.0, len(outline) / len(shore.contour))
     share = np.bincount(found.segment).astype(np.bool_).sum() / (alike * shore.shown.sum())
     if share < _SHARE or cost > (_LOOSELY * shore.sigma + _CATALOG) ** 2:
         return "not found"
-    return _Fit(told, outline, cost)
+    return _Fit(weights(found, outline, shore.sigma, len(shore.contour)), outline, cost)
 
 
 def _sums(W: FloatArray, pixels: FloatArray) -> FloatArray:
