@@ -45,8 +45,10 @@ class Ground(Protocol):
         height: ArrayLike,
         side: int = 1,
     ) -> FloatArray:
-        """Points at heights seen at ranges and sines ahead of broadside, to the right (side 1) or
-        to the left (-1); as `terrafix.models.geometry.geolocation.ground_point`.
+        """Points at heights seen at ranges and sines ahead of broadside.
+
+        To the right (side 1) or to the left (-1) of the track; otherwise as
+        `terrafix.models.geometry.geolocation.ground_point`.
         """
 
 

@@ -55,6 +55,8 @@ REASONS = (
 """What became of an image."""
 _SEEN = 0.6
 """Share of the image that must lie on the reference."""
+_FINE = 0.7
+"""Smoothing of what is correlated [pixels]."""
 _TIE = 16
 """Pixels between those whose place is looked up."""
 _COARSE = 3
@@ -135,25 +137,23 @@ def matched_aperture(
     """
     amplitude = image.amplitude()
     middle = (amplitude.shape[0] - 1) / 2, (amplitude.shape[1] - 1) / 2
-    offset = np.zeros(3)
-    quality = np.inf
-    reaches = [reach, NARROWEST]
+    offset, quality = np.zeros(3), np.inf
+    # what is far off is found with coarse pixels; then twice with fine ones
+    searches = [(reach, 1), (NARROWEST, 1)]
     if max(reach) > _COARSE_FROM:
-        reaches.insert(0, reach)
-        reaches[1] = NARROWEST
-    for k, one in enumerate(reaches):
-        coarse = _COARSE if k == 0 and max(one) > _COARSE_FROM else 1
+        searches = [(reach, _COARSE), (NARROWEST, 1), (NARROWEST, 1)]
+    for k, (one, coarse) in enumerate(searches):
         pixels = _in_pixels(image, one, coarse)
         warped, seen = _warped(image, reference, terrain, amplitude.shape, pixels, offset)
         if seen < _SEEN:
-            return _refused(image, quality, REASONS[1])
+            return _refused(quality, REASONS[1])
         shift = _shift(amplitude, warped, pixels, coarse)
         quality = min(quality, shift.quality)
         if not shift.quality >= gate:
-            return _refused(image, shift.quality, REASONS[2])
+            return _refused(shift.quality, REASONS[2])
         if not shift.inside:
-            return _refused(image, quality, REASONS[3])
-        if k < len(reaches) - 1:
+            return _refused(quality, REASONS[3])
+        if k < len(searches) - 1:
             offset = offset + _as_offset(image, middle, shift.pixels, terrain, offset)
     return _fix(image, middle, shift, terrain, offset, quality)
 
@@ -168,9 +168,9 @@ def _steps(image: ApertureImage) -> FloatArray:
 
 def _in_pixels(image: ApertureImage, reach: tuple[float, float], coarse: int) -> tuple[int, int]:
     """Reach in pixels, of which `coarse` make one."""
-    rows, columns = (int(np.ceil(m / s / coarse)) * coarse for m, s in zip(
-        reach, _steps(image), strict=True
-    ))
+    rows, columns = (
+        int(np.ceil(m / s / coarse)) * coarse for m, s in zip(reach, _steps(image), strict=True)
+    )
     return rows, columns
 
 
@@ -189,14 +189,13 @@ def _warped(
     p = image.places(rows, columns, terrain, offset)
     latitude, longitude, _ = image.ground.geodetic(p)
     i, j, inside = reference.pixel(latitude, longitude)
-    i, j = (np.where(inside, a, -1e4).astype(np.float32) for a in (i, j))
-    x, y = (_between_ties(a, wide) for a in (j, i))
+    x, y = (_between_ties(np.where(inside, a, -1e4), wide) for a in (j, i))
     warped = cv2.remap(reference.amplitude, x, y, cv2.INTER_LINEAR, borderValue=0.0)
     own = warped[reach[0] : reach[0] + shape[0], reach[1] : reach[1] + shape[1]]
     return np.asarray(warped), float((own > 0).mean())
 
 
-def _between_ties(values: Single, shape: list[int]) -> Single:
+def _between_ties(values: FloatArray, shape: list[int]) -> Single:
     """Linear interpolation of values at every `_TIE`-th pixel to all of an image."""
     y, x = (np.arange(n, dtype=np.float32) / _TIE for n in shape)
     i, j = (np.minimum(a.astype(np.intp), n - 2) for a, n in zip((y, x), values.shape, strict=True))
@@ -205,18 +204,14 @@ def _between_ties(values: Single, shape: list[int]) -> Single:
     return np.ascontiguousarray(rows[:, j] * (1 - w) + rows[:, j + 1] * w, np.float32)
 
 
-def _shift(
-    amplitude: Single, warped: Single, reach: tuple[int, int], coarse: int
-) -> Shift:
+def _shift(amplitude: Single, warped: Single, reach: tuple[int, int], coarse: int) -> Shift:
     if coarse == 1:
-        return shift_between(contrast(amplitude), contrast(warped), reach)
+        return shift_between(contrast(amplitude, fine=_FINE), contrast(warped, fine=_FINE), reach)
     own = _averaged(amplitude, coarse)
     few = reach[0] // coarse, reach[1] // coarse
     wide = _averaged(warped, coarse)[: own.shape[0] + 2 * few[0], : own.shape[1] + 2 * few[1]]
     found = shift_between(contrast(own, 8.0), contrast(wide, 8.0), few, (2, 2))
-    return Shift(
-        coarse * found.pixels, coarse**2 * found.covariance, found.quality, found.inside
-    )
+    return Shift(coarse * found.pixels, coarse**2 * found.covariance, found.quality, found.inside)
 
 
 def _averaged(image: Single, n: int) -> Single:
@@ -261,6 +256,6 @@ def _fix(
     return ApertureFix(place, measured, residual, covariance, quality, True, REASONS[0])
 
 
-def _refused(image: ApertureImage, quality: float, reason: str) -> ApertureFix:
+def _refused(quality: float, reason: str) -> ApertureFix:
     nowhere = np.full(3, np.nan), np.full(2, np.nan), np.full(2, np.nan), np.full((2, 2), np.inf)
     return ApertureFix(*nowhere, quality, False, reason)

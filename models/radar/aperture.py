@@ -3,8 +3,8 @@ r"""Echo of a short aperture, pulse by pulse from the true track, compressed in 
 A radar on an aircraft turns and shakes: its echo has no closed spectrum, and is summed over
 scatterers for every pulse (`terrafix.models.radar.pulses`). The scatterers are bright points and
 clutter, strewn at random over the terrain, several to a resolution cell: with two the echo has a
-texture of its own, which looks of it share, and map drift then "works" on a featureless field; eight
-are as good as any number. Clutter is a new draw for each aperture, so that the echo of another
+texture of its own, which looks of it share, and map drift then "works" on a featureless field; with
+eight it does not. Clutter is a new draw for each aperture, so that the echo of another
 pass, and of the next second, has speckle of its own.
 
 A scatterer of unit reflection peaks at 1 in the compressed echo, and at the number of pulses in a
@@ -39,13 +39,14 @@ from terrafix.models.radar.chirp import (
     chirp_replica,
     compression_filter,
     padded_length,
+    unit_phasor,
 )
 from terrafix.models.radar.pulses import Impulses, Pulses, PulseSums
 from terrafix.models.radar.scene import Scene, brightness
 
 _FINER = 4
-"""Cells of the impulses in one of the echo: sharing between two then errs by 1 % at the band's edge,
-after the shares' own response is divided out."""
+"""Cells of the impulses in one of the echo: sharing between two then errs by 1 % at the edge of the
+band, after the shares' own response is divided out."""
 _MARGIN = 12
 """Cells beyond both ends of the swath that are summed, whose sidelobes reach into it."""
 _SURFACE = 1.0
@@ -349,9 +350,7 @@ class LitGround:
         return float(height.min()), float(height.max())
 
     def _plane(self, along: FloatArray, across: FloatArray) -> FloatArray:
-        return np.asarray(
-            self.base + along[..., None] * self.ahead + across[..., None] * self.out
-        )
+        return np.asarray(self.base + along[..., None] * self.ahead + across[..., None] * self.out)
 
     def _look_up(self) -> None:
         """Rise above the level [m] and brightness [dB] on a grid of the rectangle."""
@@ -375,13 +374,16 @@ class LitGround:
             range(int(np.floor(a.min())) - 1, int(np.ceil(a.max())) + 2) for a in (i, j)
         )
         texture = self.scene.texture(rows, columns)
-        places = ((a - s.start).astype(np.float32) for a, s in ((j, columns), (i, rows)))
-        db += cv2.remap(texture, *places, cv2.INTER_LINEAR)
+        x32, y32 = ((a - s.start).astype(np.float32) for a, s in ((j, columns), (i, rows)))
+        db += cv2.remap(texture, x32, y32, cv2.INTER_LINEAR)
         self.cells = rows, columns
         self._surface = rise.astype(np.float32), db.astype(np.float32)
 
     def clutter(self, rng: np.random.Generator, per_cell: float = 8.0) -> Scatterers:
-        """Scatterers strewn at random, complex normal: speckle is fully developed.
+        """Scatterers strewn at random, of equal strength where the ground is equally bright.
+
+        Their phases are random. Strengths that differ (complex normal ones, say) would give the
+        echo twice the texture of its own.
 
         Parameters
         ----------
@@ -423,8 +425,8 @@ class LitGround:
         square = np.einsum("in,in->n", line, line)
         heard = (square > near * near) & (square < far * far)
         offset, db = offset[:, heard], db[heard]
-        reflection = rng.standard_normal(2 * len(db), np.float32).view(np.complex64)
-        reflection *= np.exp(db * np.float32(np.log(10) / 20)) * np.float32(np.sqrt(0.5))
+        reflection = unit_phasor(rng.random(len(db), np.float32))
+        reflection *= np.exp(db * np.float32(np.log(10) / 20))
         return Scatterers(self.base, offset, reflection)
 
     @property
@@ -453,4 +455,5 @@ def _at(values: Single, i: Single, j: Single) -> Single:
         np.pad(a.astype(np.float32, copy=False), (0, padded - len(a))).reshape(-1, width)
         for a in (j, i)
     )
-    return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR)).ravel()[: len(i)]
+    found = cv2.remap(values, x, y, cv2.INTER_LINEAR).ravel()[: len(i)]
+    return np.asarray(found, np.float32)

@@ -9,11 +9,11 @@ it was seen from the middle of the aperture,
           = \frac{\lambda \rho f}{2 V},
 
 the second written as a distance ahead. Pixels are at times :math:`\tau` of zero Doppler from the
-middle and closest ranges :math:`R_0` for the velocity :math:`V'` of compression; with
+middle and closest ranges :math:`R_0` for the velocity :math:`V'` of compression. With
 :math:`x = V'^2 \tau / V` and :math:`\rho^2 = R_0^2 + V'^2 \tau^2` they are places again, and those do
-not move when another :math:`V'` focuses the image. The true point is seen at the true velocity, so
-that an error :math:`\delta v` (truth less estimate) moves it by :math:`\delta v^T (p - r_c) / V`,
-whole: with squint, too.
+not move when another :math:`V'` focuses the image. A point is seen at the true velocity, so that an
+error :math:`\delta v` (truth less estimate) moves it by :math:`\delta v^T (p - r_c) / V`, whole:
+with squint, too.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def aperture_echo(
     centroid = 2 * line.speed * sine / radar.wavelength
     if compensate:
         beam = ground.seen(line.r, line.v, cells, sine, height, side)
-        echo = compensated(echo, radar, near_range, t, r, line, beam, centroid)
+        echo = compensated(echo, radar, t, r, line, beam, centroid)
     rate = 2 * line.speed**2 / (radar.wavelength * near_range)
     wanted = radar.prf * (radar.doppler_bandwidth / rate + _SPARE)
     domain = range_doppler(
@@ -206,7 +206,11 @@ class ApertureImage:
         return np.linalg.norm(away, axis=-1), away @ self.line.along
 
     def places(
-        self, row: ArrayLike, column: ArrayLike, terrain: Height, offset: ArrayLike = (0.0, 0.0, 0.0)
+        self,
+        row: ArrayLike,
+        column: ArrayLike,
+        terrain: Height,
+        offset: ArrayLike = (0.0, 0.0, 0.0),
     ) -> FloatArray:
         """Points (..., 3) [m] of a terrain that the estimate puts at pixels of `amplitude`.
 
@@ -220,9 +224,7 @@ class ApertureImage:
         """
         rho, ahead = self.seen(row, column)
         r = self.line.r + np.asarray(offset, np.float64)
-        return seen_on_terrain(
-            self.ground, r, self.line.v, rho, ahead / rho, terrain, self.side
-        )
+        return seen_on_terrain(self.ground, r, self.line.v, rho, ahead / rho, terrain, self.side)
 
 
 def aperture_image(echo: ApertureEcho, velocity: float | None = None) -> ApertureImage:

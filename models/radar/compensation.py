@@ -1,8 +1,8 @@
-r"""Motion compensation: echo of a track that turns and shakes, as if a straight line had been flown.
+r"""Motion compensation: echo of a track that turns and shakes, as if it had been straight.
 
-The line is the straight one through the navigator's own track, flown at constant speed. A pulse was
-sent from :math:`r(t) = r_c + l\,x(t) + d(t)`, with :math:`d` across the line. Echo of range :math:`R`
-is moved and turned by what it is farther than from the line,
+The line is the straight one through the navigator's own track, flown at constant speed. A pulse
+was sent from :math:`r(t) = r_c + l\,x(t) + d(t)`, with :math:`d` across the line. Echo of range
+:math:`R` is moved and turned by what it is farther than from the line,
 
 .. math:: \Delta R(t, R) = \lVert p(R) - r(t) \rVert - \lVert p(R) - r_c - l\,x(t) \rVert,
 
@@ -49,7 +49,7 @@ class StraightLine:
 
     @property
     def speed(self) -> float:
-        """[m/s]"""
+        """Of the line [m/s]."""
         return float(np.linalg.norm(self.v))
 
     @property
@@ -68,7 +68,6 @@ def straight_line(t: FloatArray, r: FloatArray) -> StraightLine:
 def compensated(
     echo: ComplexArray,
     radar: Radar,
-    near_range: float,
     t: FloatArray,
     r: FloatArray,
     line: StraightLine,
@@ -82,8 +81,6 @@ def compensated(
     echo : ndarray of complex64, shape (n_pulses, n_cells)
         Compressed in range.
     radar : Radar
-    near_range : float
-        Slant range of the first cell [m].
     t : ndarray, shape (n_pulses,)
         Times [s].
     r : ndarray, shape (n_pulses, 3)

@@ -12,6 +12,7 @@ and more); and peaks of the sums that leave out one block at a time (jackknife) 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -46,12 +47,24 @@ class Shift:
     inside: bool
 
 
-def contrast(amplitude: Single, broad: float = _BROAD) -> Single:
-    """Amplitude relative to its local mean, less one; zero where nothing is seen."""
+def contrast(amplitude: Single, broad: float = _BROAD, fine: float = 0.0) -> Single:
+    """Amplitude relative to its local mean, less one; zero where nothing is seen.
+
+    Parameters
+    ----------
+    amplitude : ndarray of float32, shape (n_rows, n_columns)
+        Zero where nothing is known.
+    broad : float
+        Standard deviation of the local mean [pixels].
+    fine : float
+        Of a smoothing, for where pixels are as large as what they show: their peaks would be
+        sharper than a parabola between them [pixels].
+    """
     seen = (amplitude > 0).astype(np.float32)
     mean, share = (cv2.GaussianBlur(a, (0, 0), broad) for a in (amplitude, seen))
     safe = np.where(seen > 0, mean / np.maximum(share, 1e-6), 1.0)
-    return np.asarray(seen * (amplitude / np.maximum(safe, 1e-30) - 1), np.float32)
+    found = seen * (amplitude / np.maximum(safe, 1e-30) - 1)
+    return np.asarray(cv2.GaussianBlur(found, (0, 0), fine) if fine else found, np.float32)
 
 
 def shift_between(
@@ -98,7 +111,7 @@ def shift_between(
 
 def _parts(image: Single, blocks: tuple[int, int]) -> list[tuple[slice, slice]]:
     edges = [np.linspace(0, n, k + 1).astype(int) for n, k in zip(image.shape, blocks, strict=True)]
-    rows, columns = ([slice(a, b) for a, b in zip(e[:-1], e[1:], strict=True)] for e in edges)
+    rows, columns = ([slice(a, b) for a, b in pairwise(e)] for e in edges)
     return [(i, j) for i in rows for j in columns]
 
 
@@ -121,7 +134,9 @@ def _near(surface: FloatArray, top: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(int(a + k) for a, k in zip(start, best, strict=True))
 
 
-_OFFSETS = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), -1).reshape(9, 2)
+_OFFSETS = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), -1).reshape(
+    9, 2
+)
 _Y, _X = _OFFSETS.T
 _FIT = np.linalg.pinv(np.stack([np.ones(9), _Y, _X, _Y * _Y, _X * _X, _Y * _X], axis=1))
 

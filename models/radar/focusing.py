@@ -290,11 +290,11 @@ def range_doppler(
     over(batches(n_doppler), without_migration)
     spectrum = fft.ifft(spectrum, axis=1, overwrite_x=True, workers=-1)
     stretch = 1 / d - 1
-    compressed = np.empty((n_doppler, n_cells), np.complex64)
+    straight = np.empty((n_doppler, n_cells), np.complex64)
 
     def stretch_rows(rows: slice) -> None:
         offset = slant_range - reference
-        compressed[rows] = stretched(spectrum[rows, :n_cells], offset, stretch[rows], spacing)
+        straight[rows] = stretched(spectrum[rows, :n_cells], offset, stretch[rows], spacing)
 
     over(batches(n_doppler, 256), stretch_rows)
 
@@ -306,7 +306,7 @@ def range_doppler(
         slant_range, first, last, "the scene is too small: no column is seen by a whole pulse"
     )
     return RangeDoppler(
-        compressed,
+        straight,
         frequency,
         slant_range,
         first_time,
@@ -391,8 +391,8 @@ def _compressed(
         t,
         first,
         last,
-        f"the beam sees a point for as long as lines were received, {domain.duration:.3g} s: none is "
-        "focused from all of either; receive for longer or shorter, or process another band",
+        f"the beam sees a point for as long as lines were received, {domain.duration:.3g} s: none "
+        "is focused from all of either; receive for longer or shorter, or process another band",
     )
     return Image(
         data,

@@ -43,10 +43,10 @@ from terrafix.models.core.arrays import FloatArray, Single
 from terrafix.models.radar.correlation import Shift, contrast, shift_between
 from terrafix.models.radar.focusing import Image, RangeDoppler, azimuth_looks, time_looks
 
-GATE = 6.0
+GATE = 5.5
 """Height of the peak over the rms of the correlation of two looks, at least."""
 ROUNDS = 3
-_COLUMNS = 4
+_COLUMNS = 16
 """Range cells that looks are searched for beside each other: no true shift, only the rms."""
 _CLOSE = 2e-3
 """Change of velocity [m/s] below which another round changes nothing."""
@@ -143,8 +143,7 @@ def _shift(first: Image, second: Image, velocity: float, half: float, largest: f
     rows = int(np.ceil(2 * largest / velocity * half * first.radar.prf)) + 4
     rows = min(rows, one.shape[0] // 4)
     inner = np.ascontiguousarray(one[rows:-rows, _COLUMNS:-_COLUMNS])
-    found = shift_between(inner, other, (rows, _COLUMNS))
-    return found
+    return shift_between(inner, other, (rows, _COLUMNS))
 
 
 def _amplitude(image: Image) -> Single:

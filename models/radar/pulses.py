@@ -8,10 +8,11 @@ by a micrometer until the echo is back. What a pulse receives is the sum over sc
     R_i = \lVert p_i - r \rVert, \qquad
     g_i = \bigl(1 - (s_i / s_0)^2\bigr)^3,
 
-with :math:`R_{i,0}` the range at the pulse in the middle, :math:`s_i` the sine of the angle off the plane across the antenna's long side and
-:math:`s_0` that of the pattern's first null: within 0.02 of the main lobe,
-:math:`\operatorname{sinc}^2(s / s_0)`, of a uniform aperture used both ways. Impulses lie between
-cells, so each is shared by the two cells about it, in proportion to its distance from them.
+with :math:`R_{i,0}` the range at the pulse in the middle, :math:`s_i` the sine of the angle off the
+plane across the antenna's long side, and :math:`s_0` that of the pattern's first null: within 0.02
+of the main lobe, :math:`\operatorname{sinc}^2(s / s_0)`, of a uniform aperture used both ways.
+Impulses lie between cells, so each is shared by the two cells about it, in proportion to its
+distance from them.
 
 The sums are what costs: some 1e9 terms for the echo of a second. They are compiled from
 ``pulses.c`` by whoever can (`terrafix.components.sensors.pulses`) and handed to the models, which
@@ -21,7 +22,7 @@ know no compiler; `ArraySums` computes the same with arrays, eight times slower.
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -94,11 +95,12 @@ class Pulses:
 
     def part(self, rows: slice) -> Pulses:
         """Some of the pulses."""
-        arrays = (
-            np.ascontiguousarray(a[rows]) for a in (self.way, self.axis, self.first, self.last)
-        )
-        return Pulses(
-            *arrays, self.wavelength, self.spacing, self.null, self.cut, self.n_cells
+        return replace(
+            self,
+            way=self.way[rows],
+            axis=self.axis[rows],
+            first=self.first[rows],
+            last=self.last[rows],
         )
 
 
@@ -233,8 +235,13 @@ class CompiledSums:
 
         def add(rows: slice) -> None:
             own, lines = pulses.part(rows), out[rows]
-            arrays = [np.ascontiguousarray(a, np.float64) for a in (own.way, own.axis)]
-            arrays += [own.first, own.last, *shared]
+            arrays: list[NDArray[Any]] = [
+                np.ascontiguousarray(own.way, np.float64),
+                np.ascontiguousarray(own.axis, np.float64),
+                np.ascontiguousarray(own.first, np.int64),
+                np.ascontiguousarray(own.last, np.int64),
+                *shared,
+            ]
             self._impulses(
                 *(len(lines), *(a.ctypes.data for a in arrays)),
                 *(own.wavelength, 1 / own.spacing, own.null, own.cut),

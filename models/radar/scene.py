@@ -146,7 +146,9 @@ class Scene:
         phase : ndarray, shape (n,)
             Of the reflection [cycles].
         """
-        found = [self._points(rows, part, turn) for part, turn in _within_a_turn(columns, self._turn)]
+        found = [
+            self._points(rows, part, turn) for part, turn in _within_a_turn(columns, self._turn)
+        ]
         latitude, longitude, amplitude, phase = np.hstack(found)
         return latitude, longitude, amplitude, phase
 
