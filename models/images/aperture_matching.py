@@ -39,9 +39,9 @@ from terrafix.models.radar.correlation import Shift, contrast, shift_between
 GATE = 7.0
 """Height of the peak over the rms of the correlation surface, at least: of recorded images, those
 that were matched wrongly had 5.6 to 6.6."""
-JACKKNIFE = 1.8
-"""Errors over what the jackknife claims: blocks share bright points and the pixel's grid. Measured
-by ``benchmarks/aircraft_images.py``."""
+FLOOR = (0.05, 0.05)
+"""Standard deviation of z_r and z_c that no image goes below [m]: a seventh of a pixel, where bright
+points of both passes fall between pixels. Measured by ``benchmarks/aircraft_images.py``."""
 NARROWEST = (25.0, 12.0)
 """Least reach of a search, along the track and in range [m]."""
 WIDEST = (220.0, 60.0)
@@ -59,6 +59,7 @@ _FINE = 0.7
 """Smoothing of what is correlated [pixels]."""
 _TIE = 16
 """Pixels between those whose place is looked up."""
+_NEWTON = 4
 _COARSE = 3
 """Pixels averaged in one of a coarse search."""
 _COARSE_FROM = 40.0
@@ -79,7 +80,7 @@ class ApertureFix:
     residual : ndarray, shape (2,)
         Those, less what the estimate predicts [m].
     covariance : ndarray, shape (2, 2)
-        Of both [m^2], from the image's parts, times the square of `JACKKNIFE`.
+        Of both [m^2], from the correlation surface, and `FLOOR`.
     quality : float
         Height of the peak over the rms of the correlation surface.
     accepted : bool
@@ -154,7 +155,7 @@ def matched_aperture(
         if not shift.inside:
             return _refused(quality, REASONS[3])
         if k < len(searches) - 1:
-            offset = offset + _as_offset(image, middle, shift.pixels, terrain, offset)
+            offset = _corrected(image, middle, shift.pixels, terrain, offset)
     return _fix(image, middle, shift, terrain, offset, quality)
 
 
@@ -210,7 +211,7 @@ def _shift(amplitude: Single, warped: Single, reach: tuple[int, int], coarse: in
     own = _averaged(amplitude, coarse)
     few = reach[0] // coarse, reach[1] // coarse
     wide = _averaged(warped, coarse)[: own.shape[0] + 2 * few[0], : own.shape[1] + 2 * few[1]]
-    found = shift_between(contrast(own, 8.0), contrast(wide, 8.0), few, (2, 2))
+    found = shift_between(contrast(own, 8.0), contrast(wide, 8.0), few)
     return Shift(coarse * found.pixels, coarse**2 * found.covariance, found.quality, found.inside)
 
 
@@ -220,21 +221,23 @@ def _averaged(image: Single, n: int) -> Single:
     return np.ascontiguousarray(part.mean(axis=(1, 3)), np.float32)
 
 
-def _as_offset(
+def _corrected(
     image: ApertureImage,
     middle: tuple[float, float],
     pixels: FloatArray,
     terrain: Height,
     offset: FloatArray,
 ) -> FloatArray:
-    """Change of the line's place [m] that explains a shift, within the plane of track and sight."""
-    rho0, ahead0 = image.seen(*middle)
-    rho1, ahead1 = image.seen(middle[0] + pixels[0], middle[1] + pixels[1])
+    """Offset of the line's place [m] that explains a shift, within the plane of track and sight."""
+    rho, ahead = image.seen(middle[0] + pixels[0], middle[1] + pixels[1])
     p = image.places(*middle, terrain, offset)
-    sight = p - image.line.r - offset
-    axes = np.stack([image.line.along, sight / np.linalg.norm(sight)])
-    wanted = -np.array([float(ahead1 - ahead0), float(rho1 - rho0)])
-    return np.asarray(axes.T @ np.linalg.solve(axes @ axes.T, wanted))
+    for _ in range(_NEWTON):
+        sight = p - image.line.r - offset
+        distance = float(np.linalg.norm(sight))
+        axes = np.stack([image.line.along, sight / distance])
+        missing = axes @ sight - np.array([float(ahead), float(rho)])
+        offset = offset + axes.T @ np.linalg.solve(axes @ axes.T, missing)
+    return offset
 
 
 def _fix(
@@ -251,7 +254,7 @@ def _fix(
     measured = np.array([float(rho), -float(ahead)])
     steps = _steps(image)
     to_meters = np.array([[0.0, steps[1]], [-steps[0], 0.0]])
-    covariance = JACKKNIFE**2 * to_meters @ shift.covariance @ to_meters.T
+    covariance = to_meters @ shift.covariance @ to_meters.T + np.diag(np.square(FLOOR))
     residual = measured - np.array([float(predicted[0]), -float(predicted[1])])
     return ApertureFix(place, measured, residual, covariance, quality, True, REASONS[0])
 

@@ -10,10 +10,10 @@ it was seen from the middle of the aperture,
 
 the second written as a distance ahead. Pixels are at times :math:`\tau` of zero Doppler from the
 middle and closest ranges :math:`R_0` for the velocity :math:`V'` of compression. With
-:math:`x = V'^2 \tau / V` and :math:`\rho^2 = R_0^2 + V'^2 \tau^2` they are places again, and those do
-not move when another :math:`V'` focuses the image. A point is seen at the true velocity, so that an
-error :math:`\delta v` (truth less estimate) moves it by :math:`\delta v^T (p - r_c) / V`, whole:
-with squint, too.
+:math:`x = V'^2 \tau / V` and :math:`\rho^2 = R_0^2 + V'^2 \tau^2` they are places again, and
+those do not move when another :math:`V'` focuses the image. A point is seen at the true velocity,
+so that an error :math:`\delta v` (truth less estimate) moves it by
+:math:`\delta v^T (p - r_c) / V`, whole: with squint, too.
 """
 
 from __future__ import annotations
