@@ -39,6 +39,9 @@ from terrafix.models.radar.correlation import Shift, contrast, shift_between
 GATE = 7.0
 """Height of the peak over the rms of the correlation surface, at least: of recorded images, those
 that were matched wrongly had 5.6 to 6.6."""
+PARTS = 2.5
+"""Parts of the image that must hold the peak, of 16: on mirrored references, simulated and recorded,
+peaks above the gate are held by 1 to 2, right ones by 3 and more."""
 FLOOR = (0.05, 0.05)
 """Standard deviation of z_r and z_c that no image goes below [m]: a seventh of a pixel, where bright
 points of both passes fall between pixels. Measured by ``benchmarks/aircraft_images.py``."""
@@ -51,6 +54,7 @@ REASONS = (
     "too little of it lies on the reference",
     "correlation has no peak that stands out",
     "the peak is on the border of what was searched",
+    "one bright point alone holds the peak",
 )
 """What became of an image."""
 _SEEN = 0.6
@@ -154,6 +158,8 @@ def matched_aperture(
             return _refused(shift.quality, REASONS[2])
         if not shift.inside:
             return _refused(quality, REASONS[3])
+        if not shift.parts >= PARTS:
+            return _refused(quality, REASONS[4])
         if k < len(searches) - 1:
             offset = _corrected(image, middle, shift.pixels, terrain, offset)
     return _fix(image, middle, shift, terrain, offset, quality)
@@ -212,7 +218,13 @@ def _shift(amplitude: Single, warped: Single, reach: tuple[int, int], coarse: in
     few = reach[0] // coarse, reach[1] // coarse
     wide = _averaged(warped, coarse)[: own.shape[0] + 2 * few[0], : own.shape[1] + 2 * few[1]]
     found = shift_between(contrast(own, 8.0), contrast(wide, 8.0), few)
-    return Shift(coarse * found.pixels, coarse**2 * found.covariance, found.quality, found.inside)
+    return Shift(
+        coarse * found.pixels,
+        coarse**2 * found.covariance,
+        found.quality,
+        found.inside,
+        found.parts,
+    )
 
 
 def _averaged(image: Single, n: int) -> Single:

@@ -13,6 +13,11 @@ by the slope that chance gives the surface, over the peak's curvature :math:`H`,
 with the covariance of slopes taken from the surface away from the peak. (Leaving out one block of
 the image at a time, a jackknife, claims the same over texture; where one bright point holds the
 image, the peak without it lies anywhere, and the claims scatter by a factor of three.)
+
+A peak that stands out may still be wrong: the brightest point of one image on the brightest of
+another is 20 times the rms. What tells is how many parts of the image hold the peak: with
+:math:`s_i` what each of 16 contributes, :math:`(\sum s_i)^2 / \sum s_i^2`. Right matches have 3 to
+15, mirrored references 1 to 2.
 """
 
 from __future__ import annotations
@@ -30,6 +35,8 @@ _PEAK = 8
 """Pixels about the peak that belong to it."""
 _FEWEST = 64
 """Pixels away from the peak, at least."""
+_BLOCKS = 4
+"""Parts of the image along each axis."""
 _TINY = 1e-30
 
 
@@ -47,12 +54,15 @@ class Shift:
         Height of the peak over the rms of the correlation surface.
     inside : bool
         Whether the peak is not on the border of what was searched.
+    parts : float
+        How many of 16 parts of the image hold the peak.
     """
 
     pixels: FloatArray
     covariance: FloatArray
     quality: float
     inside: bool
+    parts: float
 
 
 def contrast(amplitude: Single, broad: float = _BROAD, fine: float = 0.0) -> Single:
@@ -102,12 +112,13 @@ def shift_between(image: Single, other: Single, reach: tuple[int, int]) -> Shift
     quality = float((surface[row, column] - surface.mean()) / max(surface.std(), _TINY))
     peak = np.array([row, column], np.float64)
     middle = np.array(reach, np.float64)
+    parts = _parts(image - image.mean(), other[row:, column:])
     inside = 0 < row < surface.shape[0] - 1 and 0 < column < surface.shape[1] - 1
     if not inside:
-        return Shift(middle - peak, np.full((2, 2), np.inf), quality, False)
+        return Shift(middle - peak, np.full((2, 2), np.inf), quality, False, parts)
     slope, curvature = _parabola(surface[row - 1 : row + 2, column - 1 : column + 2])
     if not np.all(np.linalg.eigvalsh(curvature) < 0):
-        return Shift(middle - peak, np.full((2, 2), np.inf), quality, False)
+        return Shift(middle - peak, np.full((2, 2), np.inf), quality, False, parts)
     inverse = np.linalg.inv(curvature)
     peak -= np.clip(inverse @ slope, -1, 1)
     slopes = np.stack(np.gradient(surface), axis=-1)
@@ -116,7 +127,20 @@ def shift_between(image: Single, other: Single, reach: tuple[int, int]) -> Shift
     if away.sum() < _FEWEST:
         raise ValueError(f"a search of {reach} pixels is no wider than a peak")
     covariance = inverse @ np.cov(slopes[away].T) @ inverse
-    return Shift(middle - peak, covariance, quality, True)
+    return Shift(middle - peak, covariance, quality, True, parts)
+
+
+def _parts(image: Single, other: Single) -> float:
+    """How many parts of an image hold its correlation with the first pixels of another."""
+    product = image * other[: image.shape[0], : image.shape[1]]
+    held = np.array(
+        [
+            part.sum(dtype=np.float64)
+            for band in np.array_split(product, _BLOCKS, axis=0)
+            for part in np.array_split(band, _BLOCKS, axis=1)
+        ]
+    )
+    return float(held.sum() ** 2 / max(np.sum(held**2), _TINY))
 
 
 _OFFSETS = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), -1).reshape(

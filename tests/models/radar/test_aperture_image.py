@@ -61,7 +61,7 @@ def test_without_compensation_a_turn_blurs(aircraft):
 
 
 def test_pixels_are_places_again(aircraft):
-    """`pixel` undoes `seen`, with another velocity of compression too; `predicted` undoes `places`."""
+    """`pixel` undoes `seen`, with another velocity, too; `predicted` undoes `places`."""
     t, r, axis = aircraft.track(crab=0.05)
     echo = aircraft.point_echo(np.zeros((1, 3)), aircraft.aperture(t, r, axis))
     seen = aircraft.seen_by(echo, t, r, axis)
@@ -78,7 +78,7 @@ def test_pixels_are_places_again(aircraft):
 
 def test_a_straight_line_is_fitted_to_a_track():
     t = np.linspace(-0.5, 0.5, 101)
-    line = straight_line(t + 7.0, np.outer(t, [70.0, 3.0, -1.0]) + [5.0, 6.0, 7.0])
+    line = straight_line(t + 7.0, np.outer(t, [70.0, 3.0, -1.0]) + np.array([5.0, 6.0, 7.0]))
     assert line.t == pytest.approx(7.0)
     np.testing.assert_allclose(line.v, [70.0, 3.0, -1.0])
     np.testing.assert_allclose(line.r, [5.0, 6.0, 7.0])

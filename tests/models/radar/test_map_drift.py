@@ -65,7 +65,7 @@ def test_too_large_a_velocity_shifts_the_looks_as_the_paper_says(aircraft, point
 def test_halves_of_the_doppler_band_are_no_looks_of_an_aperture_shorter_than_the_beam(
     aircraft, land_echo, own
 ):
-    """An error of 0.5 m/s is found to 0.1 by halves of time, and made worse by halves of the band."""
+    """An error of 0.5 m/s is found by halves of time, and made worse by halves of the band."""
     by_time, _ = found(aircraft, land_echo, own, 0.5)
     by_band, _ = found(aircraft, land_echo, own, 0.5, looks="band")
     assert abs(by_time.velocity - aircraft.SPEED) < 0.1

@@ -1,4 +1,4 @@
-"""Sums over pulses: against the formula in double precision, and the two kinds against each other."""
+"""Sums over pulses, compiled and not, against the formula in double precision."""
 
 import warnings
 
@@ -53,7 +53,7 @@ def sums(request):
 
 
 def test_impulses_are_the_sum_in_double_precision(sums):
-    """Single precision of what is left of the range errs by 1e-6 m, 4e-4 rad; places by 1e-3 cell."""
+    """What is left of the range errs by 1e-6 m, 4e-4 rad; places by 1e-3 cell."""
     impulses, pulses, line, R0, first = case()
     found = summed(sums, impulses, pulses)
     for p, (way, axis) in enumerate(zip(pulses.way, pulses.axis, strict=True)):
