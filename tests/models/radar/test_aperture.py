@@ -73,10 +73,10 @@ def test_what_cannot_be_received_is_refused(aircraft):
     own = aircraft.aperture(t, r, axis)
     with pytest.raises(ValueError, match="2 scatterers in a resolution cell give the echo a tex"):
         LitGround(aircraft.FIELD, aircraft.GROUND, own).clutter(np.random.default_rng(0), 2.0)
+    slow = replace(aircraft.RADAR, prf=300.0, doppler_bandwidth=200.0)
     with pytest.raises(
         ValueError, match=r"a beam of 5\.0 deg holds 391 Hz of Doppler at 70\.0 m/s"
     ):
-        slow = replace(aircraft.RADAR, prf=300.0, doppler_bandwidth=200.0)
         replace(own, radar=slow, t=2 * t, r=2 * r - r.mean(axis=0))
     with pytest.raises(ValueError, match="looks to side 1"):
         replace(own, side=0)
