@@ -5,9 +5,9 @@
 Needs the AFRL "Gotcha" set (TERRAFIX_DATA). Two degrees of aspect are imaged with a track that is
 off by a position and a velocity, focused by map drift, and correlated with the image of the next
 two degrees: other speckle, the same cars. The speed is not in the data, 100 m/s are assumed.
-Printed are, for four kinds of errors, how many are right (within 0.5 m in range and 1 m along), how many
-are accepted and wrong, and the rms of what is measured less what is true. Mirrored images are the
-negative control: none must be accepted.
+Printed are, for four kinds of errors, how many are right (within 0.5 m in range and 1 m along), how
+many are accepted and wrong, and the rms of what is measured less what is true. Mirrored images are
+the negative control: none must be accepted.
 """
 
 from __future__ import annotations

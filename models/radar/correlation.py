@@ -121,7 +121,7 @@ def shift_between(image: Single, other: Single, reach: tuple[int, int]) -> Shift
         return Shift(middle - peak, np.full((2, 2), np.inf), quality, False, parts)
     inverse = np.linalg.inv(curvature)
     peak -= np.clip(inverse @ slope, -1, 1)
-    slopes = np.stack(np.gradient(surface), axis=-1)
+    slopes = np.stack([np.gradient(surface, axis=axis) for axis in (0, 1)], axis=-1)
     away = np.ones(surface.shape, np.bool_)
     away[max(row - _PEAK, 0) : row + _PEAK + 1, max(column - _PEAK, 0) : column + _PEAK + 1] = False
     if away.sum() < _FEWEST:

@@ -49,7 +49,7 @@ def relief(rms=10.0, n=300, step=10.0, length=150.0, seed=3):
     )
 
 
-HILLS = relief()
+HILLS = relief().tiled()
 FIELD = Scene(flat_dem(0.0), points_per_km2=0.0, parcels_db=0.0, smooth_db=0.0, fine_db=0.0)
 """Nothing to see: no relief, no texture, no points."""
 LAND = Scene(HILLS, seed=2, points_per_km2=300.0, detail=10)

@@ -4,8 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from terrafix.models.radar.aperture import LitGround, pulse_echo
+from terrafix.models.radar.aperture import (
+    Antenna,
+    LitGround,
+    flown_aperture,
+    pulse_echo,
+    require_lit,
+)
 from terrafix.models.radar.aperture_image import aperture_image
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT, range_compressed
 from terrafix.models.radar.scene import brightness
@@ -86,3 +93,43 @@ def test_what_cannot_be_received_is_refused(aircraft):
         LitGround(aircraft.FIELD, aircraft.GROUND, replace(own, r=r + np.array([0, 0, 1100.0])))
     with pytest.raises(ValueError, match="does not reach the ground, 3000 m below"):
         LitGround(aircraft.FIELD, aircraft.GROUND, replace(own, r=r - np.array([0, 0, 2000.0])))
+
+
+def level(n, heading=0.0, bank=0.0):
+    """Attitude (n, 4) that turns: to body, from north, east, down; passive, scalar last."""
+    angles = [[heading + 0.01 * k, 0.0, bank] for k in range(n)]
+    # the rows of a passive matrix are the axes of the body, which is what scipy turns to
+    return Rotation.from_euler("ZYX", angles).as_quat()
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_an_antenna_lies_along_the_fuselage_and_its_squint_turns_the_beam_forward(side, aircraft):
+    """A heading of 30 deg and a squint of 5: the beam's center is 5 deg forward of the wing."""
+    t = np.arange(101) / 100
+    r = np.outer(t, [60.6, 35.0, 0.0]) + np.array([0.0, 0.0, -1000.0])
+    antenna = Antenna(aircraft.BEAM, side, np.radians(5.0))
+    own = flown_aperture(
+        aircraft.RADAR, antenna, t, r, level(101, np.radians(30.0)), near_range=1460.0, n_cells=320
+    )
+    assert len(own.t) == 600
+    np.testing.assert_allclose(own.r, np.outer(own.t, [60.6, 35.0, 0.0]) + r[0], atol=1e-9)
+    heading = np.radians(30.0) + own.t  # 0.01 rad each 0.01 s
+    beam = heading + side * (np.pi / 2 - np.radians(5.0))
+    center = np.stack([np.cos(beam), np.sin(beam), 0 * beam], axis=1)
+    np.testing.assert_allclose((own.axis * center).sum(axis=1), 0.0, atol=1e-6)
+    assert (own.axis @ [60.6, 35.0, 0.0] > 0).all()
+
+
+def test_a_bank_that_lifts_the_beam_off_the_swath_is_refused(aircraft):
+    t, r, axis = aircraft.track()
+    own, antenna = aircraft.aperture(t, r, axis), Antenna(aircraft.BEAM)
+    require_lit(antenna, own, aircraft.GROUND, 0.0, level(1)[0])
+    # the right wing up by 20 deg: the swath, 37 to 43 deg below the horizon, is 57 to 63 below it
+    with pytest.raises(ValueError, match="57 to 63 deg below the wings, and the beam lights 25 to"):
+        require_lit(antenna, own, aircraft.GROUND, 0.0, level(1, bank=np.radians(-20.0))[0])
+    turned = level(9)
+    turned[4] *= 1.1
+    with pytest.raises(ValueError, match=r"the attitude at 4\.000 s is no rotation"):
+        flown_aperture(
+            aircraft.RADAR, antenna, np.arange(9.0), r[:9], turned, near_range=1460.0, n_cells=320
+        )
