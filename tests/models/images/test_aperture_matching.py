@@ -75,7 +75,7 @@ def test_an_error_of_velocity_moves_the_image_by_the_whole_of_the_sight(
     assert abs(error(fix, track, image)).max() < 0.1
 
 
-def test_errors_are_what_the_covariance_claims(aircraft, land_echo, track):
+def test_errors_are_within_what_the_covariance_claims(aircraft, land_echo, track):
     """Eight earlier passes of speckle of their own, navigators off by 3 m and 0.1 m/s."""
     rng = np.random.default_rng(4)
     errors, claims = [], []
@@ -89,10 +89,8 @@ def test_errors_are_what_the_covariance_claims(aircraft, land_echo, track):
     errors = np.sqrt(np.mean(np.square(errors), axis=0))
     assert errors[0] < 0.10  # across
     assert errors[1] < 0.12  # along
-    # the floor is that of many scenes, and eight of one share its pixels: a factor either way
-    ratio = errors / np.sqrt(np.mean(claims, axis=0))
-    assert (ratio > 0.3).all()
-    assert (ratio < 2.0).all()
+    # of one scene, whose points lie well or badly between the pixels: many are in the benchmark
+    assert (errors / np.sqrt(np.mean(claims, axis=0)) < 1.25).all()
 
 
 @pytest.mark.parametrize("dp", [(-200.0, 20.0, 10.0), (150.0, -30.0, 20.0)])
