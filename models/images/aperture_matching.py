@@ -41,8 +41,8 @@ GATE = 7.0
 that were matched wrongly had 5.6 to 6.6."""
 PARTS = 2.7
 """Parts of the image that must hold the peak, of 16. On mirrored images, simulated and recorded,
-peaks above the gate are held by 1 to 2, right ones by 3 and more; of fields with nothing but bright
-points two or three in eight are refused for it."""
+peaks above the gate are held by 1 to 2.4; right ones by 6 and more over texture and points, and by
+3 to 5 in fields with nothing but bright points, of which one in eight is refused."""
 FLOOR = (0.07, 0.08)
 """Standard deviation of z_r and z_c that no image goes below [m]: a quarter of a pixel, as bright
 points of both passes fall between pixels, and an error of velocity shears the image. Measured by

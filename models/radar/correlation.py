@@ -1,7 +1,8 @@
 r"""Where one amplitude image lies on another, how much that stands out, and how well it is held.
 
 Amplitude itself is correlated, each less its own local mean and relative to it: bright points are
-what two passes share, and the logarithm of amplitude gives them no more weight than speckle.
+what two passes share, and the logarithm of amplitude gives them no more weight than speckle. What
+is more than `_BRIGHTEST` times its surroundings counts as that.
 
 The peak of the correlation surface :math:`S`, refined by a parabola in two dimensions, is the
 shift; its height over the rms of the surface says whether it could be chance (the largest of some
@@ -17,7 +18,7 @@ image, the peak without it lies anywhere, and the claims scatter by a factor of 
 A peak that stands out may still be wrong: the brightest point of one image on the brightest of
 another is 20 times the rms. What tells is how many parts of the image hold the peak: with
 :math:`s_i` what each of 16 contributes, :math:`(\sum s_i)^2 / \sum s_i^2`. Right matches have 3 to
-15, mirrored references 1 to 2.
+15, mirrored references 1 to 2.4.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from terrafix.models.core.arrays import FloatArray, Single
 
 _BROAD = 24.0
 """Standard deviation of the local mean that is divided out [pixels]."""
+_BRIGHTEST = 8.0
+"""Contrast that counts, at most: else the brightest point outweighs all others together."""
 _PEAK = 8
 """Pixels about the peak that belong to it."""
 _FEWEST = 64
@@ -81,7 +84,7 @@ def contrast(amplitude: Single, broad: float = _BROAD, fine: float = 0.0) -> Sin
     seen = (amplitude > 0).astype(np.float32)
     mean, share = (cv2.GaussianBlur(a, (0, 0), broad) for a in (amplitude, seen))
     safe = np.where(seen > 0, mean / np.maximum(share, 1e-6), 1.0)
-    found = seen * (amplitude / np.maximum(safe, 1e-30) - 1)
+    found = seen * np.minimum(amplitude / np.maximum(safe, 1e-30) - 1, _BRIGHTEST)
     return np.asarray(cv2.GaussianBlur(found, (0, 0), fine) if fine else found, np.float32)
 
 
