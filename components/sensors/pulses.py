@@ -24,6 +24,6 @@ def pulse_sums() -> PulseSums:
         if toolchain.compilation_required():
             raise
         warnings.warn(
-            f"the echo of pulses is summed with NumPy, eight times slower: {error}", stacklevel=2
+            f"the echo of pulses is summed with NumPy, ten times slower: {error}", stacklevel=2
         )
         return ArraySums()

@@ -16,7 +16,7 @@ distance from them.
 
 The sums are what costs: some 1e9 terms for the echo of a second. They are compiled from
 ``pulses.c`` by whoever can (`terrafix.components.sensors.pulses`) and handed to the models, which
-know no compiler; `ArraySums` computes the same with arrays, eight times slower.
+know no compiler; `ArraySums` computes the same with arrays, ten times slower.
 """
 
 from __future__ import annotations

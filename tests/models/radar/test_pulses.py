@@ -94,7 +94,7 @@ def test_without_a_compiler_numpy_sums_and_says_so(monkeypatch):
     monkeypatch.setenv("TERRAFIX_KERNEL", "vm")
     compiled.pulse_sums.cache_clear()
     try:
-        with pytest.warns(UserWarning, match="summed with NumPy, eight times slower"):
+        with pytest.warns(UserWarning, match="summed with NumPy, ten times slower"):
             assert isinstance(compiled.pulse_sums(), ArraySums)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
