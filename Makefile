@@ -50,8 +50,11 @@ benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/closed_loop.py
 	$(BIN)/python benchmarks/filters.py
 	$(BIN)/python benchmarks/verdicts.py
+	$(BIN)/python benchmarks/aircraft_images.py
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
 	    then $(BIN)/python benchmarks/real_echo.py; fi
+	@if test -d "$${TERRAFIX_DATA:-../shared/data}/afrl_gotcha"; \
+	    then $(BIN)/python benchmarks/gotcha.py; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/lakes_gshhg"; \
 	    then $(BIN)/python benchmarks/lake.py; $(BIN)/python benchmarks/integer_contours.py; fi
 	@if test -f "$${TERRAFIX_DATA:-../shared/data}/dem/mark_twain_ndvi_2025.tif"; \

@@ -54,9 +54,14 @@ def track_axes(p: ArrayLike, v: ArrayLike) -> FloatArray:
 
 
 def ground_point(
-    r: ArrayLike, v: ArrayLike, slant_range: ArrayLike, sine: ArrayLike, height: ArrayLike = 0.0
+    r: ArrayLike,
+    v: ArrayLike,
+    slant_range: ArrayLike,
+    sine: ArrayLike,
+    height: ArrayLike = 0.0,
+    side: int = 1,
 ) -> FloatArray:
-    r"""Point at a height that is seen to the right at a range and a Doppler frequency.
+    r"""Point at a height that is seen at a range and a Doppler frequency.
 
     Parameters
     ----------
@@ -68,6 +73,8 @@ def ground_point(
         Sine of the angle ahead of broadside: :math:`\lambda f / (2 \lVert v \rVert)`.
     height : array_like, shape (...)
         Above the ellipsoid [m].
+    side : {1, -1}
+        To the right of the track, or to the left.
 
     Returns
     -------
@@ -89,7 +96,7 @@ def ground_point(
     ahead = v / np.linalg.norm(v, axis=-1, keepdims=True)
     down = -r + ahead * np.sum(r * ahead, axis=-1, keepdims=True)
     down /= np.linalg.norm(down, axis=-1, keepdims=True)
-    right = np.cross(down, ahead)
+    right = side * np.cross(down, ahead)
     across = R * np.sqrt(1 - s * s)
     base = r + (R * s)[..., None] * ahead
     # rotate about the track until the height is right: Newton on the look angle

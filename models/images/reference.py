@@ -10,17 +10,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray, Single, read_arrays
 from terrafix.models.geometry.geodesy import geodetic
 from terrafix.models.geometry.geolocation import Height, ground_point_on_terrain
-from terrafix.models.motion.arc import OrbitArc
+from terrafix.models.geometry.ground import seen_on_terrain
+from terrafix.models.motion.sampled import Arc
 from terrafix.models.radar.echo import ideal_image
 from terrafix.models.radar.focusing import Image
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.multilook import detected, full_index, multilook_index
 from terrafix.models.radar.scene import Scene
+
+_ROUNDS, _CLOSE = 20, 1e-3
+"""Of the search for a place's pixel, and how close it comes [pixels]."""
 
 KEYS = ("amplitude", "rows", "columns", "latitude_deg", "longitude_deg", "height_m")
 _TURN = 2 * np.pi
@@ -108,6 +112,40 @@ class Reference:
             interpolated(self.height),
         )
 
+    def pixel(
+        self, latitude: ArrayLike, longitude: ArrayLike
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Row and column, fractional, of places [rad], and whether they are inside: of `place`.
+
+        Solved by Newton's method with the mean slope of the tie points, which relief bends by less
+        than a half; where it does not settle (layover), a place counts as outside.
+
+        Parameters
+        ----------
+        latitude, longitude : array_like, shape (...)
+        """
+        wanted = np.stack([np.asarray(latitude), self.own_turn(longitude)], axis=-1)
+        i, j = np.meshgrid(self.rows, self.columns, indexing="ij")
+        ties = np.stack([np.ones_like(i), i, j], axis=-1).reshape(-1, 3)
+        known = np.stack([self.latitude, self.longitude], axis=-1).reshape(-1, 2)
+        center = known.mean(axis=0)
+        slopes = np.linalg.lstsq(ties, known - center, rcond=None)[0]
+        inverse = np.linalg.inv(slopes[1:])
+        pixel = (wanted - center - slopes[0]) @ inverse
+        low = np.array([self.rows[0], self.columns[0]])
+        high = np.array([self.rows[-1], self.columns[-1]])
+        for _ in range(_ROUNDS):
+            held = np.clip(pixel, low, high)
+            found = np.stack(self.place(held[..., 0], held[..., 1])[:2], axis=-1)
+            change = (wanted - found) @ inverse
+            pixel = held + change
+            inside = np.all((pixel >= low) & (pixel <= high), axis=-1)
+            settled = np.abs(change).max(axis=-1) < _CLOSE
+            if np.all(settled | ~inside):
+                break
+        inside &= np.abs(change).max(axis=-1) < 0.1
+        return pixel[..., 0], pixel[..., 1], inside
+
     def own_turn(self, longitude: ArrayLike) -> FloatArray:
         """The same longitudes [rad], within half a turn of the middle of the reference."""
         middle = (self.longitude.min() + self.longitude.max()) / 2
@@ -133,14 +171,14 @@ def _between(x: ArrayLike, knots: FloatArray, what: str) -> tuple[np.ndarray, Fl
 
 
 def geocoded(
-    image: Image, arc: OrbitArc, terrain: Height, looks: tuple[int, int], n_ties: int = 33
+    image: Image, arc: Arc, terrain: Height, looks: tuple[int, int], n_ties: int = 33
 ) -> Reference:
     """Reference from a focused image whose orbit is known.
 
     Parameters
     ----------
     image : Image
-    arc : OrbitArc
+    arc : Arc
         Of the radar, on the clock of the image; it must cover when the scene was in the beam.
     terrain : callable
         Height [m] at latitudes and longitudes [rad].
@@ -168,6 +206,8 @@ def earlier_pass(
     looks: tuple[int, int],
     rng: np.random.Generator,
     snr_db: float = 10.0,
+    *,
+    terrain: Height | None = None,
 ) -> Reference:
     """Reference as an ideal processor makes it of an earlier pass, with speckle of its own.
 
@@ -182,11 +222,22 @@ def earlier_pass(
         Of speckle and noise.
     snr_db : float
         Ratio of mean clutter to noise [dB].
+    terrain : callable, optional
+        Height [m] at latitudes and longitudes [rad] that who made the reference took for true; the
+        scene's own by default.
     """
-    terrain = TerrainGrid(footprint, scene)
-    amplitude = detected(ideal_image(scene, terrain, rng, snr_db=snr_db), looks)
-    rows, columns = (multilook_index(a, n) for a, n in zip(terrain.ties, looks, strict=True))
-    return Reference(amplitude, rows, columns, terrain.latitude, terrain.longitude, terrain.height)
+    grid = TerrainGrid(footprint, scene)
+    amplitude = detected(ideal_image(scene, grid, rng, snr_db=snr_db), looks)
+    rows, columns = (multilook_index(a, n) for a, n in zip(grid.ties, looks, strict=True))
+    if terrain is None:
+        return Reference(amplitude, rows, columns, grid.latitude, grid.longitude, grid.height)
+    lines, cells = grid.ties
+    t = footprint.first_time + lines / footprint.radar.prf
+    R = footprint.near_range + cells * footprint.radar.range_spacing
+    r, v = (a[:, None, :] for a in (footprint.arc.position(t), footprint.arc.velocity(t)))
+    sine = footprint.radar.wavelength * footprint.centroid / (2 * np.linalg.norm(v, axis=-1))
+    p = seen_on_terrain(footprint.ground, r, v, R[None, :], sine, terrain, footprint.side)
+    return Reference(amplitude, rows, columns, *footprint.ground.geodetic(p))
 
 
 def write_reference(reference: Reference, path: Path) -> None:

@@ -16,6 +16,7 @@ from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.batch import over_members
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.motion.gravity import earth_fixed_acceleration
+from terrafix.models.motion.sampled import Arc
 
 _DEGREE = 10
 _STEPS = 50
@@ -110,14 +111,14 @@ class OrbitArc:
 
 
 def seen_at(
-    arc: OrbitArc, p: ArrayLike, doppler: float, wavelength: float, start: ArrayLike | None = None
+    arc: Arc, p: ArrayLike, doppler: float, wavelength: float, start: ArrayLike | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Time [s] and slant range [m] at which points are seen with a Doppler frequency.
 
     Parameters
     ----------
-    arc : OrbitArc
-        Of the radar.
+    arc : Arc
+        Of the radar, an orbit's or a track's.
     p : array_like, shape (..., 3)
         Points [m], Earth-fixed.
     doppler : float

@@ -40,8 +40,7 @@ from scipy import fft
 
 from terrafix.models.core.arrays import ComplexArray, FloatArray
 from terrafix.models.core.parallel import batches, over
-from terrafix.models.geometry.geodesy import ecef
-from terrafix.models.motion.arc import OrbitArc
+from terrafix.models.motion.sampled import Arc
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Radar, chirp_replica, unit_phasor
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.history import RangeHistories, range_derivatives
@@ -105,7 +104,7 @@ class Acquisition:
 
 def simulated_echo(
     scene: Scene,
-    arc: OrbitArc,
+    arc: Arc,
     acquisition: Acquisition,
     rng: np.random.Generator,
     *,
@@ -116,7 +115,7 @@ def simulated_echo(
     Parameters
     ----------
     scene : Scene
-    arc : OrbitArc
+    arc : Arc
         True orbit; it must reach an aperture beyond the acquisition at both ends.
     acquisition : Acquisition
     rng : numpy.random.Generator
@@ -186,7 +185,7 @@ def _layer_heights(terrain: TerrainGrid) -> tuple[float, float]:
     return float(terrain.height.min()) - 1.0, float(terrain.height.max()) + 1.0
 
 
-def illuminated_footprint(arc: OrbitArc, acquisition: Acquisition) -> tuple[Footprint, int]:
+def illuminated_footprint(arc: Arc, acquisition: Acquisition) -> tuple[Footprint, int]:
     """All that an acquisition hears of, and the line of that grid which is its first."""
     radar = acquisition.radar
     at = Footprint(
@@ -271,7 +270,7 @@ def _bright_points(
     add_points(
         layers,
         terrain.footprint,
-        ecef(latitude, longitude, height),
+        terrain.footprint.ground.point(latitude, longitude, height),
         height,
         amplitude * np.exp(2j * np.pi * phase),
         heights,

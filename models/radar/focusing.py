@@ -107,6 +107,11 @@ class RangeDoppler:
     radar: Radar
     velocity_slope: float = 0.0
 
+    @property
+    def duration(self) -> float:
+        """How long lines were received [s]."""
+        return (self.n_lines - 1) / self.radar.prf
+
     def cropped(self) -> RangeDoppler:
         """Only the columns that are wholly received: less to compress."""
         columns = self.columns
@@ -131,7 +136,8 @@ class Image:
     slant_range : ndarray, shape (n_cells,)
         Closest range of each column [m].
     rows, columns : slice
-        What is focused from the whole aperture and the whole pulse.
+        What is focused from the whole aperture, or where that is shorter than the beam from all
+        lines, and from the whole pulse.
     band : tuple of float
         Lowest and highest Doppler frequency compressed [Hz].
     centroid : float
@@ -214,13 +220,14 @@ def range_doppler(
     exposure: float = 1.0,
     n_doppler: int | None = None,
     velocity_slope: float = 0.0,
+    compressed: bool = False,
 ) -> RangeDoppler:
     """Compress in range and remove range-cell migration, once for all azimuth compressions.
 
     Parameters
     ----------
     echo : ndarray of complex64, shape (n_lines, n_cells)
-        Raw echo at baseband.
+        Raw echo at baseband, or echo that is already compressed in range.
     radar : Radar
     near_range : float
         Slant range of the first cell [m]: half its delay times the speed of light.
@@ -240,6 +247,8 @@ def range_doppler(
         partly illuminated wraps around into what is.
     velocity_slope : float
         How much the effective velocity grows with range [m/s per m]; azimuth compression heeds it.
+    compressed : bool
+        Whether `echo` is compressed in range: its pulse is then one cell long.
 
     Raises
     ------
@@ -247,15 +256,17 @@ def range_doppler(
         If the echo is not a matrix of finite numbers, is shorter than a pulse, or an argument is
         outside its domain.
     """
-    n_lines, n_cells = _checked(echo, radar)
+    n_pulse = 1 if compressed else radar.n_pulse
+    n_lines, n_cells = _checked(echo, n_pulse)
     if not 0 < exposure <= 1:
         raise ValueError(f"exposure must be in (0, 1], got {exposure}")
     n_doppler = int(fft.next_fast_len(n_lines)) if n_doppler is None else n_doppler
     if n_doppler < n_lines:
         raise ValueError(f"a transform of {n_doppler} is shorter than an echo of {n_lines} lines")
-    n_fft = padded_length(radar, n_cells)
+    n_fft = int(fft.next_fast_len(n_cells)) if compressed else padded_length(radar, n_cells)
     spectrum = fft.fft(echo.astype(np.complex64, copy=False), n_fft, axis=1, workers=-1)
-    spectrum *= compression_filter(radar, n_fft, window)
+    if not compressed:
+        spectrum *= compression_filter(radar, n_fft, window)
     spectrum = fft.fft(spectrum, n_doppler, axis=0, overwrite_x=True, workers=-1)
 
     frequency = fft.fftfreq(n_doppler, 1 / radar.prf)
@@ -266,7 +277,7 @@ def range_doppler(
     spacing = radar.range_spacing
     n_shift = round(near_range * (1 - d_center) / spacing)
     slant_range = np.asarray(near_range + spacing * (np.arange(n_cells) - n_shift), np.float64)
-    reference = near_range * d_center + spacing * (n_cells - radar.n_pulse) / 2
+    reference = near_range * d_center + spacing * (n_cells - n_pulse) / 2
     f_r = fft.fftfreq(n_fft, 1 / radar.sample_rate)
     transverse = (SPEED_OF_LIGHT * frequency / (2 * velocity)) ** 2
 
@@ -279,21 +290,23 @@ def range_doppler(
     over(batches(n_doppler), without_migration)
     spectrum = fft.ifft(spectrum, axis=1, overwrite_x=True, workers=-1)
     stretch = 1 / d - 1
-    compressed = np.empty((n_doppler, n_cells), np.complex64)
+    straight = np.empty((n_doppler, n_cells), np.complex64)
 
     def stretch_rows(rows: slice) -> None:
         offset = slant_range - reference
-        compressed[rows] = stretched(spectrum[rows, :n_cells], offset, stretch[rows], spacing)
+        straight[rows] = stretched(spectrum[rows, :n_cells], offset, stretch[rows], spacing)
 
     over(batches(n_doppler, 256), stretch_rows)
 
     in_band = np.abs(frequency - centroid) <= radar.doppler_bandwidth / 2
     first = near_range * d[in_band].max()
-    last_whole = n_cells - 1 - exposure * (radar.n_pulse - 1)
+    last_whole = n_cells - 1 - exposure * (n_pulse - 1)
     last = (near_range + spacing * last_whole) * d[in_band].min()
-    columns = _inside(slant_range, first, last, "column", "a whole pulse")
+    columns = _inside(
+        slant_range, first, last, "the scene is too small: no column is seen by a whole pulse"
+    )
     return RangeDoppler(
-        compressed,
+        straight,
         frequency,
         slant_range,
         first_time,
@@ -329,8 +342,8 @@ def azimuth_compressed(
     Raises
     ------
     ValueError
-        If no line is illuminated over the whole band, or the band is empty or outside what the
-        repetition frequency samples.
+        If no line is illuminated over the whole band, nor any for all of the aperture (both are
+        equally long), or the band is empty or outside what the repetition frequency samples.
     """
     half = domain.radar.doppler_bandwidth / 2
     whole = (domain.centroid - half, domain.centroid + half)
@@ -352,8 +365,13 @@ def _compressed(
     center = float(slant_range[domain.columns].mean())
     middle = float(np.clip(domain.centroid, *frame))
     leverage = _leverage(slant_range, center, velocity, domain.velocity_slope)
+    edges = slant_range[domain.columns][[0, -1]]
+    first, last = _focused_times(domain, np.outer(_lag(np.array(frame), velocity, radar), edges))
     # rows follow the scene: a point stays at its place in the grid whatever the velocity
     shift = -center * float(_lag(np.array(middle), velocity, radar))
+    # in an aperture shorter than the beam much lies before its first line
+    before = domain.first_time + shift - first
+    shift -= max(0, int(np.ceil(before * radar.prf))) / radar.prf
     d = migration_factor(f, velocity, radar.wavelength)
     weights = get_window(window, len(rows), fftbins=False).astype(np.float32)
     data = np.zeros_like(domain.spectrum)
@@ -369,10 +387,13 @@ def _compressed(
     over(batches(len(rows)), compress)
     data = fft.ifft(data, axis=0, overwrite_x=True, workers=-1)
     t = domain.first_time + shift + np.arange(len(frequency)) / radar.prf
-    edges = slant_range[domain.columns][[0, -1]]
-    lags = np.outer(_lag(np.array(frame), velocity, radar), edges)
-    last_line = domain.first_time + (domain.n_lines - 1) / radar.prf
-    lines = _inside(t, domain.first_time - lags.min(), last_line - lags.max(), "line", "the beam")
+    lines = _inside(
+        t,
+        first,
+        last,
+        f"the beam sees a point for as long as lines were received, {domain.duration:.3g} s: none "
+        "is focused from all of either; receive for longer or shorter, or process another band",
+    )
     return Image(
         data,
         t,
@@ -385,6 +406,26 @@ def _compressed(
         radar,
         domain.velocity_slope,
     )
+
+
+def _focused_times(domain: RangeDoppler, lags: FloatArray) -> tuple[float, float]:
+    """First and last time [s] of zero Doppler of what is focused from all that can be had of it.
+
+    That is the whole band where lines are received for longer than the beam passes, and all lines
+    where the beam sees for longer than they are received (an aperture shorter than the beam).
+
+    Parameters
+    ----------
+    domain : RangeDoppler
+    lags : ndarray, shape (2, n)
+        From zero Doppler to the lower and the upper edge of the band, at some ranges [s].
+    """
+    start = domain.first_time
+    stop = start + domain.duration
+    early, late = start - lags.min(axis=0), stop - lags.max(axis=0)
+    if early.max() < late.min():
+        return float(early.max()), float(late.min())
+    return float(late.max()), float(early.min())
 
 
 def _leverage(
@@ -450,12 +491,52 @@ def azimuth_looks(
     ]
 
 
-def _checked(echo: ComplexArray, radar: Radar) -> tuple[int, int]:
+def time_looks(
+    domain: RangeDoppler, velocity: float, n_looks: int, *, window: Window = "boxcar"
+) -> list[Image]:
+    """Images from disjoint parts of the time of receiving, from its first: independent speckle.
+
+    Where an aperture is shorter than the beam, halves of its *Doppler band* show different places
+    for different times, and their shift is not that of map drift. All images are on the grid of
+    the whole aperture's, and valid where that is.
+
+    Parameters
+    ----------
+    domain : RangeDoppler
+    velocity : float
+        Effective velocity [m/s].
+    n_looks : int
+        Number of looks, equally long; the lines left over are used by none.
+    window : str or tuple
+        Weighting of the Doppler band.
+
+    Raises
+    ------
+    ValueError
+        If there is no look, fewer lines than looks, or nothing is focused.
+    """
+    length = domain.n_lines // n_looks if n_looks > 0 else 0
+    if length < 1:
+        raise ValueError(f"{domain.n_lines} lines cannot be shared by {n_looks} looks")
+    lines = fft.ifft(domain.spectrum, axis=0, workers=-1)
+    half = domain.radar.doppler_bandwidth / 2
+    band = (domain.centroid - half, domain.centroid + half)
+    images = []
+    for k in range(n_looks):
+        own = np.zeros_like(lines)
+        own[k * length : (k + 1) * length] = lines[k * length : (k + 1) * length]
+        spectrum = fft.fft(own, axis=0, overwrite_x=True, workers=-1)
+        part = replace(domain, spectrum=spectrum.astype(np.complex64, copy=False))
+        images.append(_compressed(part, velocity, band, band, window))
+    return images
+
+
+def _checked(echo: ComplexArray, n_pulse: int) -> tuple[int, int]:
     if echo.ndim != 2:
         raise ValueError(f"an echo has the shape (lines, cells), got {echo.shape}")
     n_lines, n_cells = echo.shape
-    if n_cells < radar.n_pulse:
-        raise ValueError(f"lines of {n_cells} cells are shorter than a pulse of {radar.n_pulse}")
+    if n_cells < n_pulse:
+        raise ValueError(f"lines of {n_cells} cells are shorter than a pulse of {n_pulse}")
     if not np.isfinite(echo.sum()):
         bad = int(np.argmin(np.isfinite(echo).all(axis=1)))
         raise ValueError(f"line {bad} of the echo is not finite")
@@ -470,8 +551,8 @@ def _range_scale(domain: RangeDoppler, velocity: float) -> float:
     return float(new / old)
 
 
-def _inside(axis: FloatArray, first: float, last: float, what: str, seen: str) -> slice:
+def _inside(axis: FloatArray, first: float, last: float, otherwise: str) -> slice:
     start, stop = np.searchsorted(axis, first), np.searchsorted(axis, last, side="right")
     if stop <= start:
-        raise ValueError(f"the scene is too small: no {what} is seen by {seen}")
+        raise ValueError(otherwise)
     return slice(int(start), int(stop))

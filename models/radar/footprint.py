@@ -12,11 +12,11 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
 from terrafix.models.core.arrays import FloatArray, Single
-from terrafix.models.geometry.geodesy import ecef, geodetic, local_axes
-from terrafix.models.geometry.geolocation import ground_point
-from terrafix.models.motion.arc import OrbitArc, seen_at
+from terrafix.models.geometry.ground import EllipsoidGround, Ground
+from terrafix.models.motion.arc import seen_at
+from terrafix.models.motion.sampled import Arc
 from terrafix.models.radar.chirp import Radar
-from terrafix.models.radar.scene import CELL, Scene, brightness
+from terrafix.models.radar.scene import Scene, brightness
 
 _COARSE = (16, 4)
 """Lines and cells between the points at which terrain is looked up."""
@@ -24,6 +24,11 @@ _COARSE = (16, 4)
 
 _CLOSE = 0.05
 """How well the height of the terrain must agree with where it is looked up [m]."""
+_HIGHEST = 5000.0
+"""Relief about the middle that is allowed for from orbit [m]."""
+_SPARE = 20.0
+"""Relief that is allowed for beyond what a coarse look finds [m]."""
+_EARTH = EllipsoidGround()
 _ROUNDS = 40
 """Rounds of looking up; layover, where the height has several values, ends without agreement."""
 
@@ -33,25 +38,32 @@ class Footprint:
 
     Parameters
     ----------
-    arc : OrbitArc
-        Of the radar; it must reach half an aperture beyond the grid.
+    arc : Arc
+        Of the radar, an orbit's or a track's; it must reach half an aperture beyond the grid.
     first_time, n_lines, near_range, n_cells
         Of the grid: lines at the repetition frequency, cells at the range spacing.
     radar : Radar
     centroid : float
         Doppler frequency of the beam's center [Hz].
+    ground : Ground
+        Frame of the arc.
+    side : {1, -1}
+        To the right of the track, or to the left.
     """
 
     def __init__(
         self,
-        arc: OrbitArc,
+        arc: Arc,
         radar: Radar,
         first_time: float,
         n_lines: int,
         near_range: float,
         n_cells: int,
         centroid: float,
+        ground: Ground = _EARTH,
+        side: int = 1,
     ) -> None:
+        self.ground, self.side = ground, side
         self.arc, self.radar, self.centroid = arc, radar, centroid
         self.first_time, self.n_lines = first_time, n_lines
         self.near_range, self.n_cells = near_range, n_cells
@@ -65,10 +77,10 @@ class Footprint:
         )
 
     def points(self, t: ArrayLike, slant_range: ArrayLike, height: ArrayLike) -> FloatArray:
-        """Earth-fixed points (..., 3) [m] seen at times [s] and ranges [m], at heights [m]."""
+        """Points (..., 3) [m] seen at times [s] and ranges [m], at heights [m]."""
         r, v = self.arc.position(t), self.arc.velocity(t)
         sine = self.radar.wavelength * self.centroid / (2 * np.linalg.norm(v, axis=-1))
-        return ground_point(r, v, slant_range, sine, height)
+        return self.ground.seen(r, v, slant_range, sine, height, self.side)
 
     def place(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Line and cell, fractional, at which points (..., 3) [m] are seen."""
@@ -108,7 +120,7 @@ class TerrainGrid:
         surface = _Surface(footprint, t[[0, -1]], R[[0, -1]], scene)
         self.latitude, self.longitude, self.height = surface.on(t, R)
         self.power_db = self._power_db(scene, t)
-        self._i, self._j = self.latitude / CELL, self.longitude / CELL
+        self._i, self._j = self.latitude / scene.cell, self.longitude / scene.cell
         self.cells = tuple(
             range(int(np.floor(a.min())) - 1, int(np.ceil(a.max())) + 2) for a in (self._i, self._j)
         )
@@ -145,12 +157,12 @@ class TerrainGrid:
         return np.ascontiguousarray(_between(rows.T, cells / _COARSE[1]).T)
 
     def _power_db(self, scene: Scene, t: FloatArray) -> FloatArray:
-        p = ecef(self.latitude, self.longitude, self.height)
+        p = self.footprint.ground.point(self.latitude, self.longitude, self.height)
         line = self.footprint.arc.position(t)[:, None, :] - p
         line /= np.linalg.norm(line, axis=-1, keepdims=True)
-        east, north, up = np.moveaxis(local_axes(p), -2, 0)
+        north, east, down = np.moveaxis(self.footprint.ground.axes(p), -2, 0)
         slope_north, slope_east = scene.dem.slopes(self.latitude, self.longitude)
-        normal = up - slope_north[..., None] * north - slope_east[..., None] * east
+        normal = -down - slope_north[..., None] * north - slope_east[..., None] * east
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         power = brightness(np.sum(line * normal, axis=-1))
         return 10 * np.log10(np.maximum(power, 1e-6))
@@ -165,12 +177,22 @@ class _Surface:
         self.scene = scene
         t, R = (_nodes(a, 7) for a in (times, ranges))
         middle = footprint.points(np.mean(times), np.mean(ranges), 0.0)
-        guess = float(scene.dem.at(*geodetic(middle)[:2]))
-        self.spans = (times, ranges, np.array([guess - 5000.0, guess + 5000.0]))
+        ground = footprint.ground
+        guess = float(scene.dem.at(*ground.geodetic(middle)[:2]))
+        above = float(ground.geodetic(footprint.arc.position(np.mean(times)))[2]) - guess
+        span = _HIGHEST
+        if (
+            above < 10 * _HIGHEST
+        ):  # near the ground, polynomials of height hold over its relief alone
+            grid = [np.linspace(a[0], a[1], 33) for a in (times, ranges)]
+            p = footprint.points(grid[0][:, None], grid[1][None, :], np.array(guess))
+            relief = scene.dem.at(*ground.geodetic(p)[:2]) - guess
+            span = 1.5 * float(np.abs(relief).max()) + _SPARE
+        self.spans = (times, ranges, np.array([guess - span, guess + span]))
         h = _nodes(self.spans[2], 4)
         self.start = guess
         p = footprint.points(t[:, None, None], R[None, :, None], h[None, None, :])
-        latitude, longitude, _ = geodetic(p)
+        latitude, longitude, _ = ground.geodetic(p)
         center = float(longitude.flat[0])
         longitude = center + np.angle(np.exp(1j * (longitude - center)))
         self.coefficients = [_chebyshev3(a) for a in (latitude, longitude)]

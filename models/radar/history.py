@@ -24,7 +24,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev, chebyshev
 
 from terrafix.models.core.arrays import FloatArray
-from terrafix.models.motion.arc import OrbitArc
+from terrafix.models.motion.sampled import Arc
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT
 from terrafix.models.radar.footprint import Footprint
 
@@ -82,7 +82,7 @@ class RangeHistories:
         return np.asarray(chebyshev.chebvander(scaled, _DEGREE) @ self.coefficients.T)
 
 
-def range_derivatives(arc: OrbitArc, t: float, p: FloatArray) -> FloatArray:
+def range_derivatives(arc: Arc, t: float, p: FloatArray) -> FloatArray:
     """First to fourth derivatives (n, 4) of the range to points (n, 3) at a time [m/s^k]."""
     r, v, a, j, s = (arc.derivative(t, k) for k in range(5))
     d = r - p

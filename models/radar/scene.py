@@ -58,6 +58,8 @@ class Scene:
     points_db : float
         Median brightness of a point, relative to the mean brightness of a resolution cell [dB];
         individual ones differ by 4 dB rms.
+    detail : int
+        How many times finer than `CELL` the texture is: 1 from orbit, 10 from an aircraft.
     """
 
     dem: Dem
@@ -67,16 +69,29 @@ class Scene:
     fine_db: float = 1.5
     points_per_km2: float = 3.0
     points_db: float = 25.0
+    detail: int = 1
+
+    @property
+    def cell(self) -> float:
+        """Spacing of the texture in latitude and longitude [rad]."""
+        return CELL / self.detail
+
+    @property
+    def _turn(self) -> int:
+        """Cells around the Earth."""
+        return _TURN * self.detail
 
     def __post_init__(self) -> None:
         for name in ("parcels_db", "smooth_db", "fine_db", "points_per_km2"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} of a scene cannot be {getattr(self, name)}")
+        if self.detail < 1:
+            raise ValueError(f"detail of a scene cannot be {self.detail}: 1 is the coarsest")
 
     def texture(self, rows: range, columns: range) -> Single:
         """Texture [dB] of cells, shape (len(rows), len(columns)).
 
-        Cell (i, j) is centered at latitude i and longitude j times `CELL`; a turn on is the same.
+        Cell (i, j) is centered at latitude i and longitude j times `cell`; a turn on is the same.
 
         Raises
         ------
@@ -86,12 +101,12 @@ class Scene:
         longest = max(len(rows), len(columns))
         if longest > _MOST_CELLS:
             raise ValueError(
-                f"the scene about latitude {np.degrees(rows.start * CELL):.2f} deg takes "
+                f"the scene about latitude {np.degrees(rows.start * self.cell):.2f} deg takes "
                 f"{longest} cells of its texture along one side, {_MOST_CELLS} at most\n"
                 "  its grid is one of latitude and longitude: fly farther from the pole, or "
                 "receive fewer lines and cells"
             )
-        parts = [self._texture(rows, part) for part, _ in _within_a_turn(columns)]
+        parts = [self._texture(rows, part) for part, _ in _within_a_turn(columns, self._turn)]
         return parts[0] if len(parts) == 1 else np.hstack(parts)
 
     def _texture(self, rows: range, columns: range) -> Single:
@@ -131,7 +146,9 @@ class Scene:
         phase : ndarray, shape (n,)
             Of the reflection [cycles].
         """
-        found = [self._points(rows, part, turn) for part, turn in _within_a_turn(columns)]
+        found = [
+            self._points(rows, part, turn) for part, turn in _within_a_turn(columns, self._turn)
+        ]
         latitude, longitude, amplitude, phase = np.hstack(found)
         return latitude, longitude, amplitude, phase
 
@@ -140,26 +157,26 @@ class Scene:
         for bi in range(rows.start // _BLOCK, -(-rows.stop // _BLOCK)):
             for bj in range(columns.start // _BLOCK, -(-columns.stop // _BLOCK)):
                 rng = _generator(self.seed, "points", bi, bj)
-                middle = (bi + 0.5) * _BLOCK * CELL
-                area = (_BLOCK * CELL * 6371.0) ** 2 * np.cos(middle)
+                middle = (bi + 0.5) * _BLOCK * self.cell
+                area = (_BLOCK * self.cell * 6371.0) ** 2 * np.cos(middle)
                 n = rng.poisson(max(area, 0.0) * self.points_per_km2)
                 place = rng.random((2, n)) * _BLOCK + np.array([[bi], [bj]]) * _BLOCK
                 db = self.points_db + 4.0 * rng.standard_normal(n)
                 found.append(np.vstack([place, 10 ** (db / 20), rng.random(n)]))
         i, j, amplitude, phase = np.hstack(found) if found else np.empty((4, 0))
         inside = (i >= rows.start) & (i < rows.stop) & (j >= columns.start) & (j < columns.stop)
-        j = j + turn * _TURN
-        return np.stack([i * CELL, j * CELL, amplitude, phase])[:, inside]
+        j = j + turn * self._turn
+        return np.stack([i * self.cell, j * self.cell, amplitude, phase])[:, inside]
 
 
-def _within_a_turn(columns: range) -> list[tuple[range, int]]:
+def _within_a_turn(columns: range, around: int) -> list[tuple[range, int]]:
     """Columns between 180 degrees west and east, in parts, and by how many turns they lie on."""
-    first, last = ((c + _TURN // 2) // _TURN for c in (columns.start, columns.stop - 1))
+    first, last = ((c + around // 2) // around for c in (columns.start, columns.stop - 1))
     parts = []
     for turn in range(first, last + 1):
-        west = turn * _TURN - _TURN // 2
-        start, stop = max(columns.start, west), min(columns.stop, west + _TURN)
-        parts.append((range(start - turn * _TURN, stop - turn * _TURN), turn))
+        west = turn * around - around // 2
+        start, stop = max(columns.start, west), min(columns.stop, west + around)
+        parts.append((range(start - turn * around, stop - turn * around), turn))
     return parts
 
 

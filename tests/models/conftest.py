@@ -75,12 +75,34 @@ def data_folder():
     return folder
 
 
-@pytest.fixture(scope="session")
-def points():
-    """Echo of point targets, and radars to see them with (radar/points.py)."""
+def _helper(name):
     spec = importlib.util.spec_from_file_location(
-        "points", Path(__file__).with_name("radar") / "points.py"
+        name, Path(__file__).with_name("radar") / f"{name}.py"
     )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="session")
+def points():
+    """Echo of point targets, and radars to see them with (radar/points.py)."""
+    return _helper("points")
+
+
+@pytest.fixture(scope="session")
+def aircraft():
+    """An aircraft's radar, its tracks and what it sees (radar/aircraft.py)."""
+    return _helper("aircraft")
+
+
+@pytest.fixture(scope="session")
+def land_echo(aircraft):
+    """Echo of an aperture over relief with texture and points."""
+    return aircraft.echo_of(aircraft.LAND, aircraft.aperture(*aircraft.track()), 11)
+
+
+@pytest.fixture(scope="session")
+def field_echo(aircraft):
+    """Echo of an aperture over a field with nothing on it."""
+    return aircraft.echo_of(aircraft.FIELD, aircraft.aperture(*aircraft.track()), 12, points=False)

@@ -217,7 +217,8 @@ def test_too_little_memory_is_said_before_it_starts():
 def test_a_scene_too_small_for_the_aperture_is_refused():
     text = failure(lambda: small(("echo.n_lines", "2500")))
     assert "'former': cannot form an image of 2500 lines of 560 cells" in text
-    assert "the scene is too small: no line is seen by the beam" in text
+    # the aperture is then shorter than the beam, and few lines are seen by all of it
+    assert "rows of the image are focused, and 1080 are wanted; receive more lines" in text
     assert "receive more lines or cells" in text
 
 

@@ -65,3 +65,21 @@ def test_a_reference_about_a_pole_is_refused():
 def test_latitudes_in_other_units_are_refused():
     with pytest.raises(ValueError, match="latitude of a reference is beyond a pole"):
         reference((0.0, 0.01, 0.02), latitude_deg=(91.0, 91.1, 91.2))
+
+
+def test_a_place_is_found_on_the_image_again():
+    """`pixel` undoes `place` on ties that relief has bent; what is beyond them is outside."""
+    rng = np.random.default_rng(3)
+    rows, columns = np.linspace(0, 300, 31), np.linspace(0, 200, 21)
+    i, j = np.meshgrid(rows, columns, indexing="ij")
+    bent = j + 3 * np.sin(i / 40) * np.cos(j / 30)
+    reference = Reference(
+        np.ones((301, 201), np.float32), rows, columns, 0.6 + 1e-7 * i, 0.2 + 2e-7 * bent, 0 * i
+    )
+    row, column = rng.uniform(5, 295, 50), rng.uniform(5, 195, 50)
+    latitude, longitude, _ = reference.place(row, column)
+    found = reference.pixel(latitude, longitude)
+    np.testing.assert_allclose(found[0], row, atol=1e-2)
+    np.testing.assert_allclose(found[1], column, atol=1e-2)
+    assert found[2].all()
+    assert not reference.pixel(0.6 + 1e-7 * 330, 0.2 + 2e-7 * 100)[2]

@@ -121,8 +121,11 @@ def test_scenes_that_cannot_be_focused_are_refused(points):
 
     with pytest.raises(ValueError, match="lines of 100 cells are shorter than a pulse of 432"):
         focus((64, 100))
-    with pytest.raises(ValueError, match="the scene is too small: no line is seen by the beam"):
-        focus((1024, 600))
+    # 1513 Hz at 508 Hz/s are 2.98 s, the length of 6433 lines
+    with pytest.raises(
+        ValueError, match="the beam sees a point for as long as lines were received"
+    ):
+        focus((6433, 600))
     with pytest.raises(ValueError, match=r"exposure must be in \(0, 1\]"):
         focus((64, 600), exposure=0.0)
     broken = np.ones((64, 600), np.complex64)
