@@ -73,7 +73,6 @@ class _Matching(Component):
     nominal_view = Input(**VIEW, doc="scale and turn of a frame, from the nominal position")
     prior: Any
 
-    fix = MessageOutput(fields=TARGET_FIX, doc="where the target lies in the frame")
     correlation = Output(doc="of the last frame with what it was matched to")
     reason = Output(doc="of the last match: index into terrafix.models.images.frames.REASONS")
 
@@ -123,21 +122,21 @@ class _Matching(Component):
             least=float(self.least[m]),
         )
 
-    def _tell(
-        self, t: float, y: FloatArray, from_first: FloatArray, told: Mask, seen: Mask
-    ) -> None:
-        self.reason = np.where(seen, self._reasons, self.reason)
-        self.correlation = np.where(seen, self._alike, self.correlation)
+    def _tell(self, port: Any, t: float, y: FloatArray, from_first: FloatArray, told: Mask) -> None:
         n = self.n_members
-        R = self.match_sigma[:, None, None] ** 2 * np.eye(2)
-        self.fix.publish(
+        port.publish(
             t,
             valid=told,
             y=np.where(told[:, None], y, 0.0),
             from_first=from_first.reshape(n, 4),
-            R=R,
+            R=self.match_sigma[:, None, None] ** 2 * np.eye(2),
             present=np.ones((n, 2)),
         )
+
+    def _say(self, seen: Mask) -> None:
+        """What became of frames: of the last ones, where there was none now."""
+        self.reason = np.where(seen, self._reasons, self.reason)
+        self.correlation = np.where(seen, self._alike, self.correlation)
 
     def _forget(self) -> None:
         self._reasons = np.full(self.n_members, np.nan)
@@ -154,24 +153,23 @@ def _cut(image: Single, size: int) -> Single:
 
 
 class _FrameMatcher(_Matching):
-    """Each frame sought in the first one: how far the target has moved in the frame since."""
+    """Each frame sought in the first one: how far the target has moved in the frame since.
 
-    first_frame = Choice(
-        ("unknown", "georeferenced"),
-        "unknown",
-        doc="unknown: what is told lacks the target's place in it; georeferenced: that is awaited",
-    )
+    Told twice: as it is, and with where the target lies in the first frame, if that is told.
+    """
 
     first = MessageInput(**FIELD_IMAGE, doc="the whole first frame")
     reference = MessageInput(
         fields=TARGET_FIX, optional=True, doc="where the target lies in the first frame"
     )
+    fix = MessageOutput(fields=TARGET_FIX, doc="how far the target has moved in the frame")
+    located = MessageOutput(fields=TARGET_FIX, doc="where it lies in the frame, by the reference")
 
     field = State((FIELD, FIELD), dtype=np.float32, doc="the first frame")
     first_view = State((2, 2), unit="px/m", doc="its scale and turn")
     begun = State(doc="1 where there is a first frame")
-    at_first = State((2,), unit="px", doc="where the target lies in it, as georeferenced")
-    referenced = State(doc="1 where it was georeferenced, or need not be")
+    at_first = State((2,), unit="px", doc="where the target lies in it")
+    referenced = State(doc="1 where that was told")
 
     def _begin(self) -> None:
         fresh = self.first.fresh
@@ -179,10 +177,8 @@ class _FrameMatcher(_Matching):
             self.field[fresh] = self.first.value[fresh]
             self.first_view[fresh] = self.nominal_view[fresh]
             self.begun[fresh] = 1.0
-        if self.first_frame == "unknown":
-            self.referenced[...] = 1.0
-        elif self.reference.fresh.any():
-            told = self.reference.fresh
+        told = self.reference.fresh
+        if told.any():
             self.at_first[told] = self.reference.y[told]
             self.referenced[told] = 1.0
 
@@ -192,42 +188,42 @@ class _FrameMatcher(_Matching):
         there = np.where(seen[:, None, None], self.first_view, np.eye(2))
         now = np.where(seen[:, None, None], self.nominal_view, np.eye(2))
         from_first = now @ np.linalg.inv(there)
+        turned = np.abs(from_first - np.eye(2)).max(axis=(1, 2)) > _SQUARE
         expected, sigma = self._expected(from_first)
         # where the middle of this frame lies in the first one: the target went the other way
-        at_first = np.einsum("nij,nj->ni", from_first, self.at_first)
-        place = -np.linalg.solve(from_first, (expected - at_first)[..., None])[..., 0]
-        whole, gate = np.rint(place), self._gate(sigma)
-        size, y = self.template, np.zeros((self.n_members, 2))
-        corner = (FIELD - size) // 2
+        place = -np.linalg.solve(from_first, expected[..., None])[..., 0]
+        whole = np.rint(place).astype(np.int64)
+        size, corner, y = self.template, (FIELD - self.template) // 2, np.zeros_like(place)
+        boxes = np.column_stack([corner - whole[:, 0], corner + whole[:, 1]])
+        gates = self._gate(sigma)
         self._forget()
         rows = np.flatnonzero(seen)
 
         def seek(part: slice) -> None:
             for m in rows[part]:
-                north, east = (int(w) for w in whole[m])
-                up, side = (int(g) for g in gate[m])
-                top, left = corner - north - up, corner + east - side
-                bottom, right = top + size + 2 * up, left + size + 2 * side
+                (top, left), (up, side) = boxes[m].tolist(), gates[m].tolist()
+                bottom, right = top + size + up, left + size + side
+                top, left = top - up, left - side
                 if min(top, left) < 0 or max(bottom, right) > FIELD:
                     self._reasons[m] = REASONS.index("beyond the edge of the image")
                     continue
-                template = _cut(_turned(self.frame.value[m], from_first[m]), size)
-                match = self._sought(
-                    np.ascontiguousarray(template), self.field[m, top:bottom, left:right], m
-                )
+                frame = self.frame.value[m]
+                template = _cut(_turned(frame, from_first[m]) if turned[m] else frame, size)
+                match = self._sought(template, self.field[m, top:bottom, left:right], m)
                 self._keep(m, match)
-                y[m] = north - match.row, east + match.column
+                y[m] = whole[m, 0] - match.row, whole[m, 1] + match.column
 
         over(batches(len(rows)), seek)
-        y = at_first - np.einsum("nij,nj->ni", from_first, y)
-        told = seen & (self._reasons == 0) & (self.referenced > 0.5)
-        self._tell(t, y, from_first, told, seen)
+        moved = -np.einsum("nij,nj->ni", from_first, y)
+        told = seen & (self._reasons == 0)
+        self._tell(self.fix, t, moved, from_first, told)
+        at = np.einsum("nij,nj->ni", from_first, self.at_first)
+        self._tell(self.located, t, moved + at, from_first, told & (self.referenced > 0.5))
+        self._say(seen)
 
 
 def _turned(frame: Single, from_first: FloatArray) -> Single:
     """A frame as the first one would show it, about its middle."""
-    if np.abs(from_first - np.eye(2)).max() < _SQUARE:
-        return frame
     # from (column, row) there to (column, row) here
     A = _SWAP.T @ from_first @ _SWAP
     middle = (frame.shape[0] - 1) / 2
@@ -248,6 +244,7 @@ class _Georeference(_Matching):
 
     blur = Parameter(0.5, unit="px", minimum=0.0, doc="the camera's point spread, as calibrated")
 
+    fix = MessageOutput(fields=TARGET_FIX, doc="where the target lies in the frame")
     scene = SharedInput(**SCENE, doc="the map")
     place = SharedInput(**SCENE_PLACE, doc="of the target in it")
     grid = SharedInput(**SCENE_GRID, doc="how it lies")
@@ -287,14 +284,15 @@ class _Georeference(_Matching):
                     self._reasons[m] = REASONS.index("beyond the edge of the image")
                     continue
                 image = sampled(self._map, transform[0], size)
-                template = np.ascontiguousarray(_cut(self.frame.value[m], self.template))
+                template = _cut(self.frame.value[m], self.template)
                 match = self._sought(template, image, m)
                 self._keep(m, match)
                 y[m] = target[m, 0] + match.row, target[m, 1] - match.column
 
         over(batches(len(rows)), seek)
         told = seen & (self._reasons == 0)
-        self._tell(t, y, np.broadcast_to(np.eye(2), (self.n_members, 2, 2)), told, seen)
+        self._tell(self.fix, t, y, np.broadcast_to(np.eye(2), (self.n_members, 2, 2)), told)
+        self._say(seen)
 
 
 class FrameMatcher(_FrameMatcher):

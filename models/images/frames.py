@@ -167,9 +167,13 @@ def hidden_square(frame: Single, share: float, rng: np.random.Generator) -> None
 def coded(frame: Single, noise: float, bits: int, rng: np.random.Generator) -> Single:
     """A frame with noise [codes], as whole codes from 0 to 2^bits - 1; bits 0: as it is."""
     if noise > 0:
-        frame = frame + np.float32(noise) * rng.standard_normal(frame.shape, dtype=np.float32)
+        grain = rng.standard_normal(frame.shape, dtype=np.float32)
+        grain *= np.float32(noise)
+        frame = frame + grain
     if bits:
-        frame = np.clip(np.rint(frame), 0, 2**bits - 1)
+        frame = np.rint(frame)
+        np.maximum(frame, 0.0, out=frame)
+        np.minimum(frame, 2**bits - 1, out=frame)
     return np.asarray(frame, np.float32)
 
 
@@ -225,14 +229,14 @@ def match_frame(
     """
     if method not in METHODS:
         raise ValueError(f"method must be one of {METHODS}, got '{method}'")
-    room = np.array(image.shape) - template.shape
-    if (room < 2).any() or (room % 2).any():
+    room = [a - b for a, b in zip(image.shape, template.shape, strict=True)]
+    if min(room) < 2 or any(n % 2 for n in room):
         raise ValueError(
             f"a template of {template.shape[0]} x {template.shape[1]} pixels cannot be sought in "
             f"an image of {image.shape[0]} x {image.shape[1]}: the image is larger, evenly on "
             "all sides"
         )
-    reach = room // 2
+    reach = [n // 2 for n in room]
     spread = float(cv2.meanStdDev(template)[1][0, 0])
     if spread <= max(LEAST_TEXTURE * noise, _SMOOTH):
         return FrameMatch(np.nan, np.nan, np.nan, REASONS.index("no texture"))
@@ -244,11 +248,7 @@ def match_frame(
             np.nan, np.nan, np.nan, REASONS.index("the peak lies at the edge of the gate")
         )
     rows, columns = template.shape
-    if method == "ncc":
-        alike = float(surface[i, j])
-    else:
-        found = image[i : i + rows, j : j + columns]
-        alike = float(cv2.matchTemplate(found, template, cv2.TM_CCOEFF_NORMED)[0, 0])
+    alike = _correlation(template, image[i : i + rows, j : j + columns])
     if not alike >= least:
         return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
     row, column = float(i - reach[0]), float(j - reach[1])
@@ -256,6 +256,14 @@ def match_frame(
         row += _vertex(*(float(surface[i + k, j]) for k in (-1, 0, 1)))
         column += _vertex(*(float(surface[i, j + k]) for k in (-1, 0, 1)))
     return FrameMatch(row, column, alike, 0)
+
+
+def _correlation(one: Single, other: Single) -> float:
+    """Of two images of one shape, -1 to 1; 0 where one is the same everywhere."""
+    a, b = one.ravel(), other.ravel()
+    a, b = a - a.mean(), b - b.mean()
+    size = float(a @ a) * float(b @ b)
+    return float(a @ b) / np.sqrt(size) if size > 0 else 0.0
 
 
 def _surface(template: Single, image: Single, method: str) -> Single:
@@ -277,4 +285,4 @@ def _surface(template: Single, image: Single, method: str) -> Single:
 def _vertex(before: float, peak: float, after: float) -> float:
     """Where a parabola through three values has its vertex, from the middle one."""
     bend = before - 2 * peak + after
-    return 0.0 if bend >= 0 else float(np.clip((before - after) / (2 * bend), -0.5, 0.5))
+    return 0.0 if bend >= 0 else min(max((before - after) / (2 * bend), -0.5), 0.5)
