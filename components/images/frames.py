@@ -68,6 +68,9 @@ class _Matching(Component):
     noise = Parameter(4.0, minimum=0.0, doc="of a frame's codes: twice that is no texture")
     least = Parameter(0.5, minimum=-1.0, maximum=1.0, doc="correlation of an accepted match")
     match_sigma = Parameter(0.3, unit="px", positive=True, doc="of the match, white")
+    texture = Flag(
+        False, doc="add to it what the noise of frames makes of a match in their texture"
+    )
 
     frame = MessageInput(**WINDOW_IMAGE, doc="the middle of a frame")
     nominal_view = Input(**VIEW, doc="scale and turn of a frame, from the nominal position")
@@ -129,7 +132,7 @@ class _Matching(Component):
             valid=told,
             y=np.where(told[:, None], y, 0.0),
             from_first=from_first.reshape(n, 4),
-            R=self.match_sigma[:, None, None] ** 2 * np.eye(2),
+            R=(self.match_sigma[:, None] ** 2 + self._variance)[:, None] * np.eye(2),
             present=np.ones((n, 2)),
         )
 
@@ -141,9 +144,12 @@ class _Matching(Component):
     def _forget(self) -> None:
         self._reasons = np.full(self.n_members, np.nan)
         self._alike = np.full(self.n_members, np.nan)
+        self._variance = np.zeros((self.n_members, 2))
 
     def _keep(self, m: int, match: FrameMatch) -> None:
         self._reasons[m], self._alike[m] = match.reason, match.correlation
+        if self.texture:
+            self._variance[m] = match.sigma_row**2, match.sigma_column**2
 
 
 def _cut(image: Single, size: int) -> Single:

@@ -189,12 +189,16 @@ class FrameMatch:
         Of the template with the image there, -1 to 1; NaN where there is no texture.
     reason : int
         Index into `REASONS`; 0 where it was accepted.
+    sigma_row, sigma_column : float
+        What noise of both images makes of the shift in this texture [px]; 0 for phase correlation.
     """
 
     row: float
     column: float
     correlation: float
     reason: int
+    sigma_row: float = 0.0
+    sigma_column: float = 0.0
 
 
 def match_frame(
@@ -252,10 +256,25 @@ def match_frame(
     if not alike >= least:
         return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
     row, column = float(i - reach[0]), float(j - reach[1])
+    across = [[float(surface[i + k, j]) for k in (-1, 0, 1)]]
+    across += [[float(surface[i, j + k]) for k in (-1, 0, 1)]]
     if subpixel:
-        row += _vertex(*(float(surface[i + k, j]) for k in (-1, 0, 1)))
-        column += _vertex(*(float(surface[i, j + k]) for k in (-1, 0, 1)))
-    return FrameMatch(row, column, alike, 0)
+        row, column = row + _vertex(*across[0]), column + _vertex(*across[1])
+    scale = {"ssd": 2.0, "ncc": 2.0 / (spread * spread * rows * columns), "phase": 0.0}[method]
+    sigmas = (_noise_sigma(each, noise, scale) for each in across)
+    return FrameMatch(row, column, alike, 0, *sigmas)
+
+
+def _noise_sigma(values: list[float], noise: float, scale: float) -> float:
+    r"""What noise of two images makes of their shift, from the bend of the score.
+
+    The energy of the template's slope is half of the bend of the sum of squared differences, and
+    the variance of the shift :math:`2 \sigma^2` by that energy.
+    """
+    bend = 2 * values[1] - values[0] - values[2]
+    if scale == 0.0 or bend <= 0.0:
+        return 0.0
+    return noise * float(np.sqrt(2 * scale / bend))
 
 
 def _correlation(one: Single, other: Single) -> float:
