@@ -63,6 +63,11 @@ class _Matching(Component):
 
     method = Choice(METHODS, "ssd", doc="what is compared; ssd is thrown by a change of light")
     subpixel = Flag(True, doc="go on between whole pixels, by parabolas")
+    again = Flag(
+        True,
+        doc="match a second time, shown anew where it was found: parabolas are right near whole "
+        "shifts alone",
+    )
     template = Count(WINDOW, minimum=8, doc="rows and columns of a frame that are sought")
     reach = Count(24, minimum=2, maximum=64, doc="largest shift that is looked for [px]")
     noise = Parameter(4.0, minimum=0.0, doc="of a frame's codes: twice that is no texture")
@@ -78,6 +83,10 @@ class _Matching(Component):
 
     correlation = Output(doc="of the last frame with what it was matched to")
     reason = Output(doc="of the last match: index into terrafix.models.images.frames.REASONS")
+
+    def takes(self, name: str) -> bool:
+        """Whether a setting has any effect."""
+        return name != "again" or self.subpixel
 
     def validate(self) -> None:
         """Look whether the template fits."""
@@ -217,7 +226,19 @@ class _FrameMatcher(_Matching):
                 template = _cut(_turned(frame, from_first[m]) if turned[m] else frame, size)
                 match = self._sought(template, self.field[m, top:bottom, left:right], m)
                 self._keep(m, match)
-                y[m] = whole[m, 0] - match.row, whole[m, 1] + match.column
+                row, column = match.row, match.column
+                if self.subpixel and self.again and match.reason == 0:
+                    i, j = round(row), round(column)
+                    off = (row - i, column - j)
+                    template = _cut(_turned(frame, from_first[m], off), size)
+                    top, left = top + up + i - _MARGIN, left + side + j - _MARGIN
+                    room = size + 2 * _MARGIN
+                    match = self._sought(
+                        template, self.field[m, top : top + room, left : left + room], m
+                    )
+                    self._keep(m, match)
+                    row, column = row + match.row, column + match.column
+                y[m] = whole[m, 0] - row, whole[m, 1] + column
 
         over(batches(len(rows)), seek)
         moved = -np.einsum("nij,nj->ni", from_first, y)
@@ -228,12 +249,12 @@ class _FrameMatcher(_Matching):
         self._say(seen)
 
 
-def _turned(frame: Single, from_first: FloatArray) -> Single:
-    """A frame as the first one would show it, about its middle."""
+def _turned(frame: Single, from_first: FloatArray, off: tuple[float, float] = (0.0, 0.0)) -> Single:
+    """A frame as the first one would show it, about its middle, `off` rows and columns farther."""
     # from (column, row) there to (column, row) here
     A = _SWAP.T @ from_first @ _SWAP
     middle = (frame.shape[0] - 1) / 2
-    shift = middle - A.sum(axis=1) * middle
+    shift = middle - A @ (middle + np.array(off[::-1]))
     return np.asarray(
         cv2.warpAffine(
             frame,
@@ -282,23 +303,28 @@ class _Georeference(_Matching):
 
         def seek(part: slice) -> None:
             for m in rows[part]:
-                size = self.template + 2 * int(gate[m])
-                transform = frame_to_scene(
-                    target[m : m + 1], self.nominal_view[m : m + 1], self.place, self.grid, size
-                )
-                if not inside(transform, size, self._map.shape)[0]:
-                    self._reasons[m] = REASONS.index("beyond the edge of the image")
-                    continue
-                image = sampled(self._map, transform[0], size)
-                template = _cut(self.frame.value[m], self.template)
-                match = self._sought(template, image, m)
-                self._keep(m, match)
-                y[m] = target[m, 0] + match.row, target[m, 1] - match.column
+                y[m] = self._found(m, target[m], int(gate[m]))
+                if self.subpixel and self.again and self._reasons[m] == 0:
+                    y[m] = self._found(m, y[m], _MARGIN)
 
         over(batches(len(rows)), seek)
         told = seen & (self._reasons == 0)
         self._tell(self.fix, t, y, np.broadcast_to(np.eye(2), (self.n_members, 2, 2)), told)
         self._say(seen)
+
+    def _found(self, m: int, target: FloatArray, gate: int) -> FloatArray:
+        """Where the target lies in a member's frame, sought about where it is thought to be."""
+        size = self.template + 2 * gate
+        transform = frame_to_scene(
+            target[None], self.nominal_view[m : m + 1], self.place, self.grid, size
+        )
+        if not inside(transform, size, self._map.shape)[0]:
+            self._reasons[m] = REASONS.index("beyond the edge of the image")
+            return target
+        image = sampled(self._map, transform[0], size)
+        match = self._sought(_cut(self.frame.value[m], self.template), image, m)
+        self._keep(m, match)
+        return target + np.array([match.row, -match.column])
 
 
 class FrameMatcher(_FrameMatcher):

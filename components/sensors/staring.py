@@ -20,6 +20,7 @@ from terrafix.components.fields import (
 from terrafix.components.shared import require_common
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Count, Parameter
 from terrafix.cosim.declare.ports import Input, MessageOutput, SharedInput
@@ -83,7 +84,21 @@ class StaringCamera(Component):
         scale = float(np.sqrt(np.abs(np.linalg.det(onto))))
         column, row = (float(x) for x in onto @ self.smear[0])
         self._scene: Single = blurred(self.scene, float(self.blur[0]) * scale, (row, column))
+        self._require_view()
         self._look(0.0)
+
+    def _require_view(self) -> None:
+        """Fail members that do not see the target at first; raise where none does."""
+        blind = self.environment.active & (self.off_nadir > self.widest)
+        if blind.any() and blind[self.environment.active].all():
+            angle, widest = np.degrees([self.off_nadir[blind][0], self.widest[blind][0]])
+            where = "below the horizon" if angle > 179.0 else f"{angle:.2f} deg off the nadir"
+            raise ConfigurationError(
+                f"the target is not in view of '{self.name}' at t = 0: it is {where}, and the "
+                f"camera sees up to {widest:.2f} deg\n"
+                "  the first frame is what all others are matched to: begin nearer to the target"
+            )
+        self.fail(blind, "the target is not in view at t = 0")
 
     def _step_impl(self, t: float, dt: float) -> None:
         self._look(t)

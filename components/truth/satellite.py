@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from math import pi
 
+import numpy as np
+
 from terrafix.components.fields import VIEW, XYZ
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -16,7 +18,9 @@ from terrafix.models.motion.elements import ELEMENTS, check_orbit
 from terrafix.models.motion.kepler import KeplerianElements
 from terrafix.models.sensors.staring import (
     GEOMETRIES,
+    NADIR,
     NORTH_EAST,
+    ever_in_view,
     staring_satellite_model,
 )
 
@@ -82,6 +86,20 @@ class StaringSatellite(SymbolicComponent):
             check_orbit(elements, float(self.setting("radius")))
         except ValueError as error:
             raise ConfigurationError(f"'{self.name}': {error}") from error
+
+    def validate_duration(self, duration: float) -> None:
+        """Look whether its place is above the horizon at any time."""
+        if self.geometry in NADIR:
+            return
+        model = self.whole_model
+        given = {name: self.setting(name) for name in model.parameters}
+        if not ever_in_view(model, given, duration):
+            latitude, longitude = (np.degrees(float(given[n])) for n in ("latitude", "longitude"))
+            raise ConfigurationError(
+                f"the target of '{self.name}', latitude {latitude:.3f}, longitude {longitude:.3f} "
+                f"deg, is never in view: it is below the horizon for all of {duration:g} s\n"
+                "  choose another node or true_anomaly, or the angle of the Earth at t = 0"
+            )
 
     def build_model(self) -> Model:
         """Build the model for the chosen geometry."""

@@ -40,6 +40,8 @@ from math import pi
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
 
 from terrafix.models.core.model import Model, rk4
 from terrafix.models.geometry.earth import EARTH
@@ -47,6 +49,7 @@ from terrafix.models.geometry.frames import rotate_about_pole
 from terrafix.models.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from terrafix.models.motion.elements import ELEMENTS, state_of_elements
 from terrafix.models.motion.gravity import j2_acceleration
+from terrafix.models.motion.kepler import KeplerianElements
 
 GEOMETRIES = ("sphere", "wgs84", "stars")
 """Aimed at the nadir on a sphere, or on the ellipsoid; or at a place, pointed by the stars."""
@@ -252,3 +255,33 @@ def staring_satellite_model(geometry: str) -> Model:
         step=dt,
         time=time if geometry not in NADIR else None,
     )
+
+
+_STEPS, _LONGEST = 200, 60.0
+"""A run is looked through in so many steps, or more, of at most so long [s]."""
+
+
+def ever_in_view(model: Model, parameters: Mapping[str, ArrayLike], duration: float) -> bool:
+    """Whether the place that a nominal orbit is aimed at is above the horizon at any time.
+
+    Parameters
+    ----------
+    model : Model
+        Of `staring_satellite_model`.
+    parameters : mapping of str to array_like
+        Its parameters.
+    duration : float
+        Of the run [s].
+    """
+    n_steps = max(_STEPS, int(np.ceil(duration / _LONGEST)))
+    step = duration / n_steps
+    elements = [float(np.asarray(parameters[name])) for name in ELEMENTS]
+    r, v = KeplerianElements(*elements).state(float(np.asarray(parameters["mu"])))
+    states: dict[str, ArrayLike] = {"r": r, "v": v, "r_nominal": r, "v_nominal": v}
+    outputs = model(**states, **parameters)
+    for k in range(1, n_steps + 1):
+        if float(outputs["off_nadir"][0]) < pi / 2:
+            return True
+        outputs, ends = model.advance(**states, **parameters, step=step, time=k * step)
+        states = {name: ends[name] for name in states}
+    return bool(float(outputs["off_nadir"][0]) < pi / 2)
