@@ -39,6 +39,13 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     ),
     *("last_known_orbit", "orbit_evaluation", "orbit_evaluation_considered"),
     *("orbit_predict", "orbit_predict_considered"),  # in systems/test_leo_lake
+    *("ground_scene", "staring_camera", "staring_satellite"),
+    *("frame_georeference", "frame_georeference_printed"),
+    *("frame_matcher", "frame_matcher_printed"),
+    *("known_pointing", "known_pointing_printed", "target_predict", "target_predict_printed"),
+    *("target_correct", "target_correct_located"),
+    *("target_correct_misprinted", "target_correct_printed"),
+    *("target_evaluation", "target_evaluation_printed"),  # in systems/test_geolocation
 }
 FOREIGN = {"fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
 SIZES = (1, 7, 100)

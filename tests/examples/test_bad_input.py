@@ -77,14 +77,18 @@ SYSTEM_MISTAKES = {
         "type = 3",
         "ConfigurationError: 'imu' has the type 3, which is no name\n"
         "  component types: antenna_mount, attitude_sensor, contour_moments, earlier_pass, fmu, "
-        "fmu_loop, image_album, image_former, image_matcher, image_moments, imu, lake_camera, "
+        "fmu_loop, frame_georeference, frame_georeference_printed, frame_matcher, "
+        "frame_matcher_printed, ground_scene, image_album, image_former, image_matcher, "
+        "image_moments, imu, known_pointing, known_pointing_printed, lake_camera, "
         "lake_catalog, lake_correct, lake_correct_considered, lake_imager, last_known_orbit, "
         "last_known_state, linear, lvlh_attitude, mekf_correct, mekf_predict, "
         "mekf_predict_smoothed, navigation_evaluation, orbit, orbit_evaluation, "
         "orbit_evaluation_considered, orbit_predict, orbit_predict_considered, "
         "recorded_attitude, recorded_echo, recorded_imu, recorded_orbit, recorded_reference, "
-        "reference_file, scene_echo, "
-        "synthetic_sar_fix, terrain",
+        "reference_file, scene_echo, staring_camera, staring_satellite, synthetic_sar_fix, "
+        "target_correct, target_correct_located, target_correct_misprinted, "
+        "target_correct_printed, target_evaluation, target_evaluation_printed, "
+        "target_predict, target_predict_printed, terrain",
     ),
     "table that is misspelled": edit(
         "[component.orbit]",
