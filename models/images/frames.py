@@ -256,25 +256,31 @@ def match_frame(
     if not alike >= least:
         return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
     row, column = float(i - reach[0]), float(j - reach[1])
-    across = [[float(surface[i + k, j]) for k in (-1, 0, 1)]]
-    across += [[float(surface[i, j + k]) for k in (-1, 0, 1)]]
+    lines = (surface[:, j], i), (surface[i], j)
     if subpixel:
-        row, column = row + _vertex(*across[0]), column + _vertex(*across[1])
-    scale = {"ssd": 2.0, "ncc": 2.0 / (spread * spread * rows * columns), "phase": 0.0}[method]
-    sigmas = (_noise_sigma(each, noise, scale) for each in across)
+        row, column = (
+            whole + _vertex(*(float(line[at + k]) for k in (-1, 0, 1)))
+            for whole, (line, at) in zip((row, column), lines, strict=True)
+        )
+    unit = {"ssd": 1.0, "ncc": 2.0 * spread * spread * rows * columns, "phase": 0.0}[method]
+    sigmas = (_noise_sigma(line, at, noise, unit) for line, at in lines)
     return FrameMatch(row, column, alike, 0, *sigmas)
 
 
-def _noise_sigma(values: list[float], noise: float, scale: float) -> float:
-    r"""What noise of two images makes of their shift, from the bend of the score.
+def _noise_sigma(score: Single, at: int, noise: float, unit: float) -> float:
+    r"""What noise of two images makes of the vertex of a parabola through their score.
 
-    The energy of the template's slope is half of the bend of the sum of squared differences, and
-    the variance of the shift :math:`2 \sigma^2` by that energy.
+    With :math:`q` the sum of squared differences, :math:`b = q_1 - 2 q_0 + q_{-1}`, the vertex has
+    the variance :math:`2 \sigma^2 (q_2 - q_0) / b^2`; :math:`q_2 - q_0` is :math:`2 b` in a
+    texture that is smooth over two pixels, and less in others.
     """
-    bend = 2 * values[1] - values[0] - values[2]
-    if scale == 0.0 or bend <= 0.0:
+    bend = unit * float(2 * score[at] - score[at - 1] - score[at + 1])
+    if unit == 0.0 or bend <= 0.0:
         return 0.0
-    return noise * float(np.sqrt(2 * scale / bend))
+    fall = 2.0 * bend
+    if 2 <= at < len(score) - 2:
+        fall = min(fall, unit * float(score[at] - (score[at - 2] + score[at + 2]) / 2))
+    return noise * float(np.sqrt(2.0 * max(fall, 0.0))) / bend
 
 
 def _correlation(one: Single, other: Single) -> float:
