@@ -28,6 +28,8 @@ EXAMPLES = ROOT / "examples"
 DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT / ".." / "shared" / "data"))
 PROFILES = ("non_updated", "image_matched", "image_corrected", "map_matched")
 ORBITS = ("LEO", "MOL")
+PLACE = ("-25.25 deg", "-54.66 deg")
+"""In the overlap of two rows of the satellite."""
 NCC = (("matcher.method", "ncc"), ("georeference.method", "ncc"))
 EFFECTS: dict[str, tuple[tuple[str, str], ...]] = {
     "point spread 1 px": (("camera.blur", "1 px"), ("georeference.blur", "1 px")),
@@ -150,6 +152,8 @@ def others(files: list[str], few: int) -> None:
         path = Path(file).with_name("other_pass.toml")
         path.write_text(text)
         settings = [("scene.file", str(Path(file).absolute())), ("map_matcher.method", "ncc"), *NCC]
+        for part in ("scene", "map", "satellite"):
+            settings += [(f"{part}.latitude", PLACE[0]), (f"{part}.longitude", PLACE[1])]
         print(f"scene of {Path(file).name}, map of band 4")
         fly(str(path), few, *settings)
         path.unlink()

@@ -263,15 +263,15 @@ def match_frame(
             for whole, (line, at) in zip((row, column), lines, strict=True)
         )
     unit = {"ssd": 1.0, "ncc": 2.0 * spread * spread * rows * columns, "phase": 0.0}[method]
-    sigmas = (_noise_sigma(line, at, noise, unit) for line, at in lines)
+    sigmas = (_noise_sigma(line, at, noise, unit, rows * columns) for line, at in lines)
     return FrameMatch(row, column, alike, 0, *sigmas)
 
 
-def _noise_sigma(score: Single, at: int, noise: float, unit: float) -> float:
+def _noise_sigma(score: Single, at: int, noise: float, unit: float, n_pixels: int) -> float:
     r"""What noise of two images makes of the vertex of a parabola through their score.
 
     With :math:`q` the sum of squared differences, :math:`b = q_1 - 2 q_0 + q_{-1}`, the vertex has
-    the variance :math:`2 \sigma^2 (q_2 - q_0) / b^2`; :math:`q_2 - q_0` is :math:`2 b` in a
+    the variance :math:`2 \sigma^2 (q_2 - q_0 + N \sigma^2) / b^2`; :math:`q_2 - q_0` is :math:`2 b` in a
     texture that is smooth over two pixels, and less in others.
     """
     bend = unit * float(2 * score[at] - score[at - 1] - score[at + 1])
@@ -280,7 +280,7 @@ def _noise_sigma(score: Single, at: int, noise: float, unit: float) -> float:
     fall = 2.0 * bend
     if 2 <= at < len(score) - 2:
         fall = min(fall, unit * float(score[at] - (score[at - 2] + score[at + 2]) / 2))
-    return noise * float(np.sqrt(2.0 * max(fall, 0.0))) / bend
+    return noise * float(np.sqrt(2.0 * (max(fall, 0.0) + n_pixels * noise * noise))) / bend
 
 
 def _correlation(one: Single, other: Single) -> float:
