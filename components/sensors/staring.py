@@ -56,7 +56,7 @@ class StaringCamera(Component):
     turn_rate = Parameter(0.0, unit="rad/s", doc="of the frame about its middle, known to nobody")
     stretch_rate = Parameter(0.0, unit="1/s", doc="of the frame about its middle, known to nobody")
     hidden = Parameter(
-        0.0, minimum=0.0, maximum=0.9, doc="share of each frame behind a cloud that drifts"
+        0.0, minimum=0.0, maximum=0.9, doc="share of the middle of a frame that a cloud can hide"
     )
     widest = Parameter(pi / 2, unit="rad", positive=True, doc="largest angle off the nadir")
     stare = Parameter(1.0, unit="s", positive=True, doc="how long it looks, of each cycle")
@@ -125,7 +125,7 @@ class StaringCamera(Component):
                 frame = sampled(self._scene, transform[m], size)
                 frame *= np.float32(1.0 + self.light_rate[m] * t)
                 if self.hidden[m] > 0.0:
-                    hidden_square(frame, float(self.hidden[m]), rng)
+                    hidden_square(frame, round(WINDOW * self.hidden[m] ** 0.5), rng)
                 images[m] = coded(frame, float(self.noise[m]), self.bits, rng)
 
         over(batches(len(rows)), render)

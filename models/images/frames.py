@@ -156,11 +156,9 @@ def sampled(scene: Single, transform: FloatArray, size: int) -> Single:
     )
 
 
-def hidden_square(frame: Single, share: float, rng: np.random.Generator) -> None:
-    """Hide a share of a frame behind a bright square somewhere in it, in place."""
-    rows, columns = frame.shape
-    side = round(np.sqrt(share * rows * columns))
-    row, column = (int(rng.integers(0, n - side + 1)) for n in (rows, columns))
+def hidden_square(frame: Single, side: int, rng: np.random.Generator) -> None:
+    """Hide a part of a frame behind a bright square of a side [px] somewhere in it, in place."""
+    row, column = (int(rng.integers(0, n - side + 1)) for n in frame.shape)
     frame[row : row + side, column : column + side] = _CLOUD
 
 
@@ -271,8 +269,8 @@ def _noise_sigma(score: Single, at: int, noise: float, unit: float, n_pixels: in
     r"""What noise of two images makes of the vertex of a parabola through their score.
 
     With :math:`q` the sum of squared differences, :math:`b = q_1 - 2 q_0 + q_{-1}`, the vertex has
-    the variance :math:`2 \sigma^2 (q_2 - q_0 + N \sigma^2) / b^2`; :math:`q_2 - q_0` is :math:`2 b` in a
-    texture that is smooth over two pixels, and less in others.
+    the variance :math:`2 \sigma^2 (q_2 - q_0 + N \sigma^2) / b^2`, where :math:`q_2 - q_0` is
+    :math:`2 b` in a texture that is smooth over two pixels, and less in others.
     """
     bend = unit * float(2 * score[at] - score[at - 1] - score[at + 1])
     if unit == 0.0 or bend <= 0.0:

@@ -170,10 +170,10 @@ def test_codes_are_whole_and_cut_off():
     assert coded(image, 0.0, 0, rng) is image
 
 
-def test_a_cloud_hides_its_share():
+def test_a_cloud_hides_its_square():
     image = np.zeros((48, 48), np.float32)
-    hidden_square(image, 0.25, np.random.default_rng(0))
-    assert (image > 0).mean() == pytest.approx(0.25, abs=0.01)
+    hidden_square(image, 24, np.random.default_rng(0))
+    assert (image > 0).mean() == pytest.approx(0.25, abs=1e-9)
 
 
 def test_bad_input_is_refused(scene):
