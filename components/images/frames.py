@@ -122,7 +122,7 @@ class _Matching(Component):
     def _gate(self, sigma: FloatArray) -> np.ndarray:
         """Half widths of the gate, north and east, whole pixels (n, 2)."""
         wanted = np.ceil(_SIGMAS * sigma) + _MARGIN
-        return np.minimum(wanted, self.reach).astype(np.int64)
+        return np.asarray(np.minimum(wanted, self.reach), np.int64)
 
     def _sought(self, template: Single, image: Single, m: int) -> FrameMatch:
         return match_frame(
@@ -324,7 +324,7 @@ class _Georeference(_Matching):
         image = sampled(self._map, transform[0], size)
         match = self._sought(_cut(self.frame.value[m], self.template), image, m)
         self._keep(m, match)
-        return target + np.array([match.row, -match.column])
+        return np.asarray(target + np.array([match.row, -match.column]))
 
 
 class FrameMatcher(_FrameMatcher):

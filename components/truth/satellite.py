@@ -91,7 +91,7 @@ class StaringSatellite(SymbolicComponent):
         """Look whether its place is above the horizon at any time."""
         if self.geometry in NADIR:
             return
-        model = self.whole_model
+        model = self.build_model()
         given = {name: self.setting(name) for name in model.parameters}
         if not ever_in_view(model, given, duration):
             latitude, longitude = (np.degrees(float(given[n])) for n in ("latitude", "longitude"))

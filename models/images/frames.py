@@ -92,7 +92,8 @@ def blurred(scene: Single, sigma: float, motion: tuple[float, float] = (0.0, 0.0
     """
     result = scene
     if sigma > 0:
-        result = cv2.GaussianBlur(result, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+        spread = cv2.GaussianBlur(result, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+        result = np.asarray(spread, np.float32)
     length = float(np.hypot(*motion))
     if length > _SMOOTH:
         half = int(np.ceil(length / 2)) + 1
@@ -102,8 +103,9 @@ def blurred(scene: Single, sigma: float, motion: tuple[float, float] = (0.0, 0.0
             i, j = int(row), int(column)
             u, w = row - i, column - j
             kernel[i : i + 2, j : j + 2] += np.outer((1 - u, u), (1 - w, w)).astype(np.float32)
-        result = cv2.filter2D(result, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
-    return np.asarray(result, np.float32)
+        moved = cv2.filter2D(result, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
+        result = np.asarray(moved, np.float32)
+    return result
 
 
 def frame_to_scene(
