@@ -15,7 +15,8 @@ A template T of a frame is sought in a larger image S within a gate of shifts s,
 
 the first of which is thrown by a change of light. Between whole pixels the peak is that of a
 parabola through it and its neighbors, along rows and along columns: its error depends on the part
-of a pixel by which the images are shifted, and lasts as long as that does.
+of a pixel by which the images are shifted, and lasts as long as that does. Where the images differ
+by far in a part of the template (a cloud in one of them), it is sought again without that part.
 
 Images have rows downward, which is south, and columns to the east.
 
@@ -33,7 +34,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray, Single
 
@@ -52,6 +53,10 @@ REASONS = (
 LEAST_TEXTURE = 2.0
 """Standard deviation of a template, at least, in those of its noise: below, nothing is matched."""
 
+_DOUBTFUL = 0.9
+"""Correlation below which a match is looked through for what hides a part of the ground."""
+_OUTLIER, _LEAST_SEEN, _ALL_SEEN = 4.0, 0.4, 0.98
+"""Differences beyond, in robust sigmas, are of what hides it; parts of a template that is seen."""
 _SMOOTH = 1e-6
 _CLOUD = 250.0
 """Code of a cloud."""
@@ -244,15 +249,21 @@ def match_frame(
     spread = float(cv2.meanStdDev(template)[1][0, 0])
     if spread <= max(LEAST_TEXTURE * noise, _SMOOTH):
         return FrameMatch(np.nan, np.nan, np.nan, REASONS.index("no texture"))
+    rows, columns = template.shape
     surface = _surface(template, image, method)
-    best = int(surface.argmax())
-    i, j = divmod(best, surface.shape[1])
+    i, j = divmod(int(surface.argmax()), surface.shape[1])
+    found = image[i : i + rows, j : j + columns]
+    alike = _correlation(template, found)
+    if alike < _DOUBTFUL:
+        both = _seen_in_both(template, found)
+        if both is not None:
+            surface = _masked_surface(template, image, method, both)
+            i, j = divmod(int(surface.argmax()), surface.shape[1])
+            alike = _correlation(template[both], image[i : i + rows, j : j + columns][both])
     if i in (0, 2 * reach[0]) or j in (0, 2 * reach[1]):
         return FrameMatch(
             np.nan, np.nan, np.nan, REASONS.index("the peak lies at the edge of the gate")
         )
-    rows, columns = template.shape
-    alike = _correlation(template, image[i : i + rows, j : j + columns])
     if not alike >= least:
         return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
     row, column = float(i - reach[0]), float(j - reach[1])
@@ -281,6 +292,27 @@ def _noise_sigma(score: Single, at: int, noise: float, unit: float, n_pixels: in
     if 2 <= at < len(score) - 2:
         fall = min(fall, unit * float(score[at] - (score[at - 2] + score[at + 2]) / 2))
     return noise * float(np.sqrt(2.0 * (max(fall, 0.0) + n_pixels * noise * noise))) / bend
+
+
+def _seen_in_both(template: Single, found: Single) -> NDArray[np.bool_] | None:
+    """Pixels at which neither image shows what hides the ground; None where that is not a part.
+
+    They differ there by more than `_OUTLIER` robust standard deviations of all differences.
+    """
+    off = template - found
+    off -= np.median(off)
+    both: NDArray[np.bool_] = np.abs(off) <= _OUTLIER * 1.4826 * np.median(np.abs(off))
+    whole = cv2.erode(both.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return whole if _LEAST_SEEN <= whole.mean() < _ALL_SEEN else None
+
+
+def _masked_surface(
+    template: Single, image: Single, method: str, seen: NDArray[np.bool_]
+) -> Single:
+    """Score at every shift of the pixels of a template that are seen, higher where it is better."""
+    kind, sign = (cv2.TM_SQDIFF, -1) if method == "ssd" else (cv2.TM_CCOEFF_NORMED, 1)
+    score = cv2.matchTemplate(image, template, kind, mask=seen.astype(np.float32))
+    return np.asarray(sign * np.nan_to_num(score), np.float32)
 
 
 def _correlation(one: Single, other: Single) -> float:
