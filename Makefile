@@ -54,6 +54,7 @@ benchmarks: $(STAMP)
 	    then $(BIN)/python benchmarks/real_echo.py; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/lakes_gshhg"; \
 	    then $(BIN)/python benchmarks/lake.py; fi
+	$(BIN)/python benchmarks/geolocation.py
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

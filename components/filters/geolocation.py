@@ -34,7 +34,7 @@ from terrafix.models.geometry.earth import EARTH
 from terrafix.models.sensors.staring import GEOMETRIES
 
 _PRINTED = ("r", "v", "pitch", "roll", "target")
-_TOLD = (*_PRINTED, "bias")
+_TOLD = (*_PRINTED, "bias", "mismatch")
 
 
 class _KnownPointing(SymbolicComponent):
@@ -92,7 +92,6 @@ class TargetPredict(FilterPredict):
 
     default_rate = Rate("1")
     error_state, process, told = TRACKING, tracking_process("wgs84"), _TOLD
-    sigmas = {"mismatch": "mismatch_sigma"}  # noqa: RUF012
 
     posterior = MessageInput(
         fields=estimate_fields(TRACKING),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -50,6 +50,8 @@ from terrafix.models.images.frames import (
 
 _SIGMAS, _MARGIN = 4.0, 2
 """The gate: so many predicted sigmas, and so many pixels besides."""
+_BIAS, _MISMATCH = slice(10, 12), slice(12, 14)
+"""Where they lie in the error of `TRACK`; the target lies at 6, or in `PRINTED_TRACK` at 8."""
 _SQUARE = 1e-6
 """Where two views are the same."""
 _SWAP = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -60,6 +62,7 @@ class _Matching(Component):
     """What matching to the first frame and to a map have in common."""
 
     default_rate = Rate("1")
+    target_at: ClassVar[slice] = slice(6, 8)
 
     method = Choice(METHODS, "ssd", doc="what is compared; ssd is thrown by a change of light")
     subpixel = Flag(True, doc="go on between whole pixels, by parabolas")
@@ -111,11 +114,11 @@ class _Matching(Component):
         """What a match to the first frame would give, by the filter, and its sigma: (n, 2) each."""
         prior = self.prior
         H = np.zeros((self.n_members, 2, prior.P.shape[1]))
-        H[:, :, 8:10] = np.eye(2)
+        H[:, :, self.target_at] = np.eye(2)
         y = prior.target.copy()
         if hasattr(prior, "bias"):
             y += np.einsum("nij,nj->ni", from_first, prior.bias) + prior.mismatch
-            H[:, :, 10:12], H[:, :, 12:14] = from_first, np.eye(2)
+            H[:, :, _BIAS], H[:, :, _MISMATCH] = from_first, np.eye(2)
         variance = np.einsum("nij,njk,nik->ni", H, prior.P, H) + self.match_sigma[:, None] ** 2
         return y, np.sqrt(np.maximum(variance, 0.0))
 
@@ -294,7 +297,7 @@ class _Georeference(_Matching):
     def _match(self, t: float) -> None:
         seen = self.frame.fresh & self.environment.active
         target = self.prior.target
-        P = self.prior.P[:, 8:10, 8:10]
+        P = self.prior.P[:, self.target_at, self.target_at]
         sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
         gate = self._gate(np.hypot(sigma, self.match_sigma[:, None])).max(axis=1)
         y = np.zeros((self.n_members, 2))
@@ -336,6 +339,7 @@ class FrameMatcher(_FrameMatcher):
 class PrintedFrameMatcher(_FrameMatcher):
     """The same about an estimate of the ten printed states."""
 
+    target_at = slice(8, 10)
     prior = BundleInput(PRINTED_TRACK, doc="estimate before the fix of this instant")
 
 
@@ -350,4 +354,5 @@ class PrintedFrameGeoreference(_Georeference):
     """The same about an estimate of the ten printed states."""
 
     default_rate = Rate(times=["0"])
+    target_at = slice(8, 10)
     prior = BundleInput(PRINTED_TRACK, doc="estimate before the fix of this instant")

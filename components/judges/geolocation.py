@@ -6,7 +6,7 @@ from terrafix.components.filters.family import estimate_fields
 from terrafix.components.judges.filter_evaluation import FilterEvaluation
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.ports import BundleInput
-from terrafix.models.filters.geolocation import MATCHED, OFFSET, PRINTED, TRACKING
+from terrafix.models.filters.geolocation import EVALUATED, MATCHED, OFFSET, PRINTED, TRACKING
 
 
 class PrintedTargetEvaluation(FilterEvaluation):
@@ -18,10 +18,10 @@ class PrintedTargetEvaluation(FilterEvaluation):
 
 
 class TargetEvaluation(FilterEvaluation):
-    """The same of a filter that has, after these ten, what nobody knows the truth of."""
+    """Errors of a filter that has position, velocity and target first; NEES of the target."""
 
     default_rate = Rate("1")
-    error_state, observation, judged = PRINTED, MATCHED, ("target",)
+    error_state, observation, judged = EVALUATED, MATCHED, ("target",)
     called = {"r": "position", "v": "velocity"}  # noqa: RUF012
 
     estimate = BundleInput(estimate_fields(TRACKING), doc="to be evaluated")

@@ -57,12 +57,18 @@ PRINTED = ErrorState(
 )
 """Ten states: position and velocity, inertial; pitch and roll; the target in the frame."""
 
+_BLOCKS = {block.name: block for block in PRINTED}
+
+EVALUATED = ErrorState(*(_BLOCKS[name] for name in ("r", "v", "target")))
+"""What a covariance can tell jointly: with pitch and roll besides, the target is known by them."""
+
 TRACKING = ErrorState(
-    *PRINTED,
+    *EVALUATED,
+    *(_BLOCKS[name] for name in ("pitch", "roll")),
     vector("bias", 2, unit="px", labels=NORTH_EAST),
     vector("mismatch", 2, unit="px", labels=NORTH_EAST),
 )
-"""The same, with what the first frame does not tell, and the error of matches that lasts."""
+"""The ten, with what the first frame does not tell, and the error of matches that lasts."""
 
 _MOVING = ("r", "v", "pitch", "roll")
 """Blocks that the target is a function of."""
@@ -108,9 +114,8 @@ def tracking_process(geometry: str) -> Process:
         push = ca.blockcat([[dt**3 / 3 * eye, dt**2 / 2 * eye], [dt**2 / 2 * eye, dt * eye]])
         turn = given["attitude_sigma"] ** 2 * (1 - ca.exp(-2 * dt / given["attitude_time"]))
         Q = ca.diagcat(push, turn, turn)
-        onto = ca.vertcat(ca.SX.eye(8), target_slope(end, given, geometry))
-        moved = ca.mtimes(onto, ca.mtimes(Q, onto.T))
-        return ca.diagcat(moved, ca.SX.zeros(4, 4))
+        onto = _onto(TRACKING, target_slope(end, given, geometry))
+        return ca.mtimes(onto, ca.mtimes(Q, onto.T))
 
     return Process(
         step=step,
@@ -123,6 +128,18 @@ def tracking_process(geometry: str) -> Process:
             **dict.fromkeys(("accel_psd", "attitude_time", "attitude_sigma"), 1),
         },
     )
+
+
+def _onto(state: ErrorState, slope: Any, bias: Any | None = None) -> Any:
+    """Derivative (n, 8) of an error state by position, velocity, pitch and roll.
+
+    Of the target it is `slope` (2, 8), of the bias what is given, of all else zero.
+    """
+    eye, at = ca.SX.eye(8), {"r": (0, 3), "v": (3, 6), "pitch": (6, 7), "roll": (7, 8)}
+    rows = {name: eye[begin:end, :] for name, (begin, end) in at.items()} | {"target": slope}
+    if bias is not None:
+        rows["bias"] = bias
+    return ca.vertcat(*(rows.get(b.name, ca.SX.zeros(b.size, 8)) for b in state))
 
 
 def target_slope(values: Mapping[str, Any], given: Mapping[str, Any], geometry: str) -> Any:
@@ -194,7 +211,8 @@ def known_pointing_model(state: ErrorState, geometry: str, first_frame: str = "u
         Inputs ``r_nominal``, ``v_nominal``, ``aim``, (3,) each; parameters ``position_sigma`` [m],
         ``velocity_sigma`` [m/s], (3,) each, ``attitude_sigma`` [rad], those of the geometry, and
         ``georeference_sigma`` [px] where the first frame is georeferenced. Outputs ``start.*`` of
-        all blocks but the mismatch, and ``start.P`` of rank 8, or 10 with a georeference.
+        all blocks, and ``start.P`` of rank 8, or 10 with a georeference: the first frame matches
+        itself, without an error.
 
     Raises
     ------
@@ -220,19 +238,15 @@ def known_pointing_model(state: ErrorState, geometry: str, first_frame: str = "u
     sigma = ca.vertcat(
         p["position_sigma"], p["velocity_sigma"], p["attitude_sigma"], p["attitude_sigma"]
     )
-    onto = ca.vertcat(ca.SX.eye(8), slope)
-    own = ca.SX.zeros(0, 0)
+    bias, own = -slope, ca.SX.zeros(state.size)
     if "bias" in state.places:
-        values["bias"] = ca.SX.zeros(2)
-        own = ca.SX.zeros(2, 2)
-        if first_frame == "georeferenced":
-            p["georeference_sigma"] = ca.SX.sym("georeference_sigma")
-            own = p["georeference_sigma"] ** 2 * ca.SX.eye(2)
-            onto = ca.vertcat(onto, ca.SX.zeros(2, 8))
-        else:
-            values["bias"] = -values["target"]
-            onto = ca.vertcat(onto, -slope)
-    P = ca.mtimes(onto, ca.mtimes(ca.diag(sigma * sigma), onto.T))
-    P += ca.diagcat(ca.SX.zeros(10, 10), own)
-    outputs = {f"start.{name}": value for name, value in values.items()}
+        values |= {"bias": -values["target"], "mismatch": ca.SX.zeros(2)}
+    if first_frame == "georeferenced":
+        place = state.places["bias"]
+        p["georeference_sigma"] = ca.SX.sym("georeference_sigma")
+        values["bias"], bias = ca.SX.zeros(2), None
+        own[place.start : place.stop] = p["georeference_sigma"] ** 2
+    onto = _onto(state, slope, bias if "bias" in state.places else None)
+    P = ca.mtimes(onto, ca.mtimes(ca.diag(sigma * sigma), onto.T)) + ca.diag(own)
+    outputs = {f"start.{block.name}": values[block.name] for block in state}
     return Model("known_pointing", inputs=inputs, parameters=p, outputs={**outputs, "start.P": P})

@@ -27,6 +27,7 @@ SIGMA = {"position_sigma": [500.0] * 3, "velocity_sigma": [0.8333] * 3, "attitud
 LOOK = {"pixel": 100.0, "radius": RADIUS}
 GIVEN = {"mu": MU, "radius": RADIUS, "j2": 0.0, "attitude_time": 600.0, "attitude_sigma": 5e-4}
 GIVEN |= {"pixel": 100.0, "accel_psd": 2.3148e-3, "target_psd": 0.16667, "aim": AIM}
+T = slice(6, 8)  # of the target
 GIVEN |= {"mismatch_sigma": 0.1, "mismatch_time": 2.0, "r_nominal": R}
 
 
@@ -51,11 +52,14 @@ def test_the_printed_start_is_what_the_target_is_by_the_others():
 def test_what_the_first_frame_does_not_tell_is_minus_the_target():
     """A match of the first frame with itself is known beforehand: t + b has no variance."""
     P = start(TRACKING)["start.P"]
-    H = np.concatenate([np.zeros((2, 8)), np.eye(2), np.eye(2)], axis=1)
+    H = np.zeros((2, 14))
+    H[:, T], H[:, 10:12], H[:, 12:] = np.eye(2), np.eye(2), np.eye(2)
     np.testing.assert_allclose(H @ P @ H.T, 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.sqrt(np.diag(P)[T]), 5.47, atol=0.01)
     P = start(TRACKING, first_frame="georeferenced")["start.P"]
-    np.testing.assert_allclose(np.sqrt(np.diag(P)[10:]), 0.2)
+    np.testing.assert_allclose(np.sqrt(np.diag(P)[10:12]), 0.2)
     np.testing.assert_array_equal(P[10:, :10], 0.0)
+    np.testing.assert_array_equal(P[12:], 0.0)
 
 
 def moved(state: ErrorState, process, values, P, steps=1):
@@ -77,8 +81,7 @@ def test_the_target_follows_from_the_others_and_so_does_its_covariance():
     rng = np.random.default_rng(5)
     values = {"r": R + rng.normal(0, 300, 3), "v": V, "pitch": 1e-4, "roll": -2e-4}
     values |= {"target": [0, 0], "bias": [0, 0], "mismatch": [0, 0]}
-    P = np.zeros((14, 14))
-    P[:12, :12] = start(TRACKING)["start.P"]
+    P = start(TRACKING)["start.P"]
     end, P = moved(TRACKING, tracking_process("sphere"), values, P, steps=20)
     x = {n: ca.SX.sym(n, 3 if n == "r" else 1) for n in ("r", "pitch", "roll")}
     look = {k: ca.DM(v) for k, v in GIVEN.items()}
@@ -87,9 +90,9 @@ def test_the_target_follows_from_the_others_and_so_does_its_covariance():
     at = ca.Function("at", list(x.values()), [offset, slope])
     t, G = (np.asarray(a) for a in at(*(end[n] for n in x)))
     np.testing.assert_allclose(end["target"], t, atol=1e-9)
-    keep = [0, 1, 2, 6, 7]
-    np.testing.assert_allclose(P[8:10, 8:10], G @ P[np.ix_(keep, keep)] @ G.T, rtol=1e-6)
-    np.testing.assert_allclose(P[8:10, :8], G @ P[keep, :8], rtol=1e-6, atol=1e-9)
+    keep = [0, 1, 2, 8, 9]
+    np.testing.assert_allclose(P[T, T], G @ P[np.ix_(keep, keep)] @ G.T, rtol=1e-6)
+    np.testing.assert_allclose(P[T, :6], G @ P[keep, :6], rtol=1e-6, atol=1e-9)
 
 
 def test_noise_of_a_step_is_that_of_a_double_integrator_and_of_gauss_and_markov():
@@ -100,7 +103,7 @@ def test_noise_of_a_step_is_that_of_a_double_integrator_and_of_gauss_and_markov(
     q = GIVEN["accel_psd"]
     np.testing.assert_allclose(np.diag(Q)[:6], [q / 3] * 3 + [q] * 3, rtol=1e-9)
     np.testing.assert_allclose(Q[0, 3], q / 2, rtol=1e-9)
-    np.testing.assert_allclose(np.diag(Q)[6:8], 25e-8 * (1 - np.exp(-2 / 600)), rtol=1e-9)
+    np.testing.assert_allclose(np.diag(Q)[8:10], 25e-8 * (1 - np.exp(-2 / 600)), rtol=1e-9)
     np.testing.assert_allclose(np.diag(Q)[12:], 0.01 * (1 - np.exp(-1.0)), rtol=1e-9)
     np.testing.assert_array_equal(np.diag(Q)[10:12], 0.0)
 
