@@ -8,6 +8,7 @@ from terrafix.components.filters.family import (
     FilterCorrect,
     FilterPredict,
     estimate_fields,
+    fix_fields,
     start_fields,
     starting_sigmas,
 )
@@ -18,14 +19,17 @@ from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
 from terrafix.models.filters.error_state import ErrorState
 from terrafix.models.filters.geolocation import (
+    ATTITUDES,
     FIRST_FRAME,
     LOCATED,
     MATCHED,
     MISPRINTED,
     OFFSET,
+    POINTING,
     PRINTED,
     TRACKING,
     known_pointing_model,
+    pointing_fix_model,
     printed_process,
     tracking_process,
 )
@@ -101,14 +105,16 @@ class TargetPredict(FilterPredict):
     )
 
     geometry = Choice(GEOMETRIES, "wgs84", doc="as of the satellite")
+    attitude = Choice(ATTITUDES, "wander", doc="what pitch and roll follow: a process, or a gyro")
     mu = Parameter(EARTH.mu, unit="m^3/s^2", positive=True, doc="gravitational parameter")
     radius = Parameter(EARTH.radius, unit="m", positive=True, doc="equatorial, or of the sphere")
     j2 = Parameter(EARTH.j2, doc="second zonal coefficient; 0: two bodies")
     accel_psd = Parameter(unit="m^2/s^3", minimum=0.0, doc="of white acceleration")
-    attitude_sigma = Parameter(unit="rad", positive=True, doc="of pitch and of roll")
+    attitude_sigma = Parameter(5e-4, unit="rad", positive=True, doc="of pitch and of roll (wander)")
     attitude_time = Parameter(600.0, unit="s", positive=True, doc="that they are correlated over")
     pixel = Parameter(100.0, unit="m", positive=True, doc="its size on the ground (nadir)")
     pixel_angle = Parameter(1e-4, unit="rad", positive=True, doc="that a pixel sees (stars)")
+    angle_random_walk = Parameter(0.0, unit="rad/s^0.5", minimum=0.0, doc="of the gyro (gyro)")
     mismatch_sigma = Parameter(
         0.1, unit="px", positive=True, doc="of the error of matches that lasts"
     )
@@ -116,13 +122,16 @@ class TargetPredict(FilterPredict):
 
     aim = Input((3,), unit="m", frame="i", doc="point that the camera is aimed at")
     r_nominal = Input((3,), unit="m", frame="i", doc="position that it should have")
+    delta_theta_b = Input(
+        (3,), unit="rad", frame="b", default=0.0, doc="of pitch and roll, by a gyro (gyro)"
+    )
 
     def build_model(self) -> Model:
         """Build the model of the process for the chosen geometry."""
         return predict_model(
             "target_predict",
             self.error_state,
-            tracking_process(self.geometry),
+            tracking_process(self.geometry, self.attitude),
             told=self.told,
             sigmas=starting_sigmas(self.error_state, self.told, self.sigmas),
             restarts=True,
@@ -134,6 +143,28 @@ class TargetCorrect(FilterCorrect):
 
     default_rate = Rate("1")
     error_state, observation = TRACKING, MATCHED
+
+
+class PointingCorrect(FilterCorrect):
+    """By pitch and roll, as a star tracker tells them."""
+
+    default_rate = Rate("1")
+    error_state, observation = TRACKING, POINTING
+
+
+class PointingFix(SymbolicComponent):
+    """Pitch and roll from what an attitude sensor measures."""
+
+    default_rate = Rate("1")
+
+    noise_sigma = Parameter(unit="rad", positive=True, doc="of the sensor, per sample and axis")
+
+    q_be = Input((4,), frame="b", doc="measured turn off the commanded attitude")
+    fix = MessageOutput(fields=fix_fields(POINTING), doc="pitch and roll")
+
+    def build_model(self) -> Model:
+        """Build the model."""
+        return pointing_fix_model()
 
 
 class LocatedTargetCorrect(FilterCorrect):

@@ -37,6 +37,7 @@ from terrafix.cosim.declare.ports import (
 )
 from terrafix.models.core.arrays import Single
 from terrafix.models.core.parallel import batches, over
+from terrafix.models.filters.geolocation import FIRST_FRAME
 from terrafix.models.images.frames import (
     METHODS,
     REASONS,
@@ -176,6 +177,12 @@ class _FrameMatcher(_Matching):
     Told twice: as it is, and with where the target lies in the first frame, if that is told.
     """
 
+    first_frame = Choice(
+        FIRST_FRAME,
+        "unknown",
+        doc="whether the prior is of a filter that takes `fix` (unknown), or `located`",
+    )
+
     first = MessageInput(**FIELD_IMAGE, doc="the whole first frame")
     reference = MessageInput(
         fields=TARGET_FIX, optional=True, doc="where the target lies in the first frame"
@@ -208,6 +215,9 @@ class _FrameMatcher(_Matching):
         from_first = now @ np.linalg.inv(there)
         turned = np.abs(from_first - np.eye(2)).max(axis=(1, 2)) > _SQUARE
         expected, sigma = self._expected(from_first)
+        at = np.einsum("nij,nj->ni", from_first, self.at_first)
+        if self.first_frame == "georeferenced":
+            expected = expected - at
         # where the middle of this frame lies in the first one: the target went the other way
         place = -np.linalg.solve(from_first, expected[..., None])[..., 0]
         whole = np.rint(place).astype(np.int64)
@@ -247,7 +257,6 @@ class _FrameMatcher(_Matching):
         moved = -np.einsum("nij,nj->ni", from_first, y)
         told = seen & (self._reasons == 0)
         self._tell(self.fix, t, moved, from_first, told)
-        at = np.einsum("nij,nj->ni", from_first, self.at_first)
         self._tell(self.located, t, moved + at, from_first, told & (self.referenced > 0.5))
         self._say(seen)
 

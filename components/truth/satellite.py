@@ -76,6 +76,9 @@ class StaringSatellite(SymbolicComponent):
     v_nominal = Output((3,), unit="m/s", frame="i", labels=XYZ, doc="velocity, likewise")
     aim = Output((3,), unit="m", frame="i", labels=XYZ, doc="point that the camera is aimed at")
     nominal_view = Output(**VIEW, doc="scale and turn of the frame, from the nominal position")
+    q_be = Output((4,), frame="b", doc="turn off the commanded attitude: what a star tracker sees")
+    delta_theta_b = Output((3,), unit="rad", frame="b", labels=XYZ, doc="of it, in the last step")
+    delta_v_b = Output((3,), unit="m/s", frame="b", labels=XYZ, doc="that is felt: none")
     off_nadir = Output(unit="rad", doc="of the nominal line of sight; pi below the horizon")
 
     def validate(self) -> None:

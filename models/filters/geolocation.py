@@ -39,6 +39,7 @@ from terrafix.models.core.model import Model
 from terrafix.models.filters.error_state import ErrorState, vector
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.process import Process
+from terrafix.models.geometry.quaternion import rotation_vector
 from terrafix.models.motion.gravity import j2_acceleration
 from terrafix.models.sensors.staring import (
     GEOMETRIES,
@@ -94,25 +95,41 @@ def printed_process() -> Process:
     )
 
 
-def tracking_process(geometry: str) -> Process:
+ATTITUDES = ("wander", "gyro")
+"""What pitch and roll follow: a Gauss-Markov process, or the increments of a gyro."""
+
+
+def tracking_process(geometry: str, attitude: str = "wander") -> Process:
     """The same, but that the target is where the others put it, and a lasting error of matches.
 
     Parameters
     ----------
     geometry : str
         Of `terrafix.models.sensors.staring.GEOMETRIES`.
+    attitude : str
+        Of `ATTITUDES`. With a gyro pitch and roll follow its ``delta_theta_b``, with its angle
+        random walk for noise; its bias is not estimated, which wants a star tracker beside it.
     """
+    gyro = attitude == "gyro"
+    wander = ("angle_random_walk",) if gyro else ("attitude_time", "attitude_sigma")
 
     def step(x: Mapping[str, Any], given: Mapping[str, Any], dt: Any, _: Any) -> dict[str, Any]:
         r, v = coasting(_gravity(given))(x["r"], x["v"], dt)
-        kept = ca.exp(-dt / given["attitude_time"])
-        end = {"r": r, "v": v, "pitch": kept * x["pitch"], "roll": kept * x["roll"]}
+        if gyro:
+            turned = [x[n] + given["delta_theta_b"][k] for k, n in enumerate(("pitch", "roll"))]
+        else:
+            kept = ca.exp(-dt / given["attitude_time"])
+            turned = [kept * x[name] for name in ("pitch", "roll")]
+        end = {"r": r, "v": v, "pitch": turned[0], "roll": turned[1]}
         return {**end, "target": target_offset(end, given, geometry)}
 
     def spread(_: Any, end: Mapping[str, Any], given: Mapping[str, Any], dt: Any) -> Any:
         eye = given["accel_psd"] * ca.SX.eye(3)
         push = ca.blockcat([[dt**3 / 3 * eye, dt**2 / 2 * eye], [dt**2 / 2 * eye, dt * eye]])
-        turn = given["attitude_sigma"] ** 2 * (1 - ca.exp(-2 * dt / given["attitude_time"]))
+        if gyro:
+            turn = given["angle_random_walk"] ** 2 * dt
+        else:
+            turn = given["attitude_sigma"] ** 2 * (1 - ca.exp(-2 * dt / given["attitude_time"]))
         Q = ca.diagcat(push, turn, turn)
         onto = _onto(TRACKING, target_slope(end, given, geometry))
         return ca.mtimes(onto, ca.mtimes(Q, onto.T))
@@ -121,11 +138,11 @@ def tracking_process(geometry: str) -> Process:
         step=step,
         spread=spread,
         decays={"mismatch": ("mismatch_time", "mismatch_sigma")},
-        inputs={"aim": 3, "r_nominal": 3},
+        inputs={"aim": 3, "r_nominal": 3, **({"delta_theta_b": 3} if gyro else {})},
         parameters={
             **GRAVITY,
             **look_parameters(geometry),
-            **dict.fromkeys(("accel_psd", "attitude_time", "attitude_sigma"), 1),
+            **dict.fromkeys(("accel_psd", *wander), 1),
         },
     )
 
@@ -182,6 +199,34 @@ LOCATED = Observation(
     lambda x, _: x["target"] + x["mismatch"], dict.fromkeys(NORTH_EAST, "px"), fields=_FIELDS
 )
 """The target's place in the frame, of an image that was matched to the map itself."""
+
+
+POINTING = Observation(
+    lambda x, _: ca.vertcat(x["pitch"], x["roll"]), dict.fromkeys(("pitch", "roll"), "rad")
+)
+"""Pitch and roll, as a star tracker tells them."""
+
+
+def pointing_fix_model() -> Model:
+    """A fix of pitch and roll from a measured turn off the commanded attitude.
+
+    Returns
+    -------
+    Model
+        Input ``q_be`` (4,), small turns of pitch and roll and about the line of sight; parameter
+        ``noise_sigma`` [rad]. Outputs the fields of the message ``fix``.
+    """
+    q, sigma = ca.SX.sym("q_be", 4), ca.SX.sym("noise_sigma")
+    return Model(
+        "pointing_fix",
+        inputs={"q_be": q},
+        parameters={"noise_sigma": sigma},
+        outputs={
+            "fix.y": rotation_vector(q)[:2],
+            "fix.R": sigma**2 * ca.SX.eye(2),
+            "fix.present": ca.SX.ones(2),
+        },
+    )
 
 
 def _square(flat: Any) -> Any:

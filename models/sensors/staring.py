@@ -47,6 +47,7 @@ from terrafix.models.core.model import Model, rk4
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import rotate_about_pole
 from terrafix.models.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from terrafix.models.geometry.quaternion import from_small_rotation_vector
 from terrafix.models.motion.elements import ELEMENTS, state_of_elements
 from terrafix.models.motion.gravity import j2_acceleration
 from terrafix.models.motion.kepler import KeplerianElements
@@ -194,7 +195,9 @@ def staring_satellite_model(geometry: str) -> Model:
         roll, stationary Gauss-Markov processes in exact steps; those of `LOOK`; those of `PLACE`
         where it is aimed at one. Outputs ``r``, ``v``, ``r_nominal``, ``v_nominal``, ``aim``, (3,)
         each; ``pitch``, ``roll``; ``target`` (2,) [px]; ``view`` and ``nominal_view`` (2, 2)
-        [px/m]; ``off_nadir`` [rad], of the nominal line of sight.
+        [px/m]; ``off_nadir`` [rad], of the nominal line of sight. For inertial sensors ``q_be``
+        (4,), the turn off the commanded attitude by pitch, roll and nothing, and over the last
+        step ``delta_theta_b`` [rad] of it and ``delta_v_b`` [m/s], which is zero, (3,) each.
 
     Raises
     ------
@@ -204,6 +207,7 @@ def staring_satellite_model(geometry: str) -> Model:
     if geometry not in GEOMETRIES:
         raise ValueError(f"geometry must be one of {GEOMETRIES}, got '{geometry}'")
     sizes = {"r": 3, "v": 3, "r_nominal": 3, "v_nominal": 3, "pitch": 1, "roll": 1}
+    sizes["delta_theta_b"] = 3
     x = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     names = {*ELEMENTS, "mu", "radius", "j2", "accel_psd", "attitude_sigma", "attitude_time"}
     names |= {*LOOK[geometry], *(() if geometry in NADIR else PLACE)}
@@ -221,6 +225,8 @@ def staring_satellite_model(geometry: str) -> Model:
     nominal = coast(x["r_nominal"], x["v_nominal"], dt)
     kept = ca.exp(-dt / p["attitude_time"])
     turn = p["attitude_sigma"] * ca.sqrt(1 - kept * kept) * w["turn"]
+    off = ca.vertcat(x["pitch"], x["roll"])
+    turned = kept * off + turn
     given = {**p, "r_nominal": x["r_nominal"]}
     given["aim"] = aim_point(x["r_nominal"], given, geometry, time)
     return Model(
@@ -241,8 +247,9 @@ def staring_satellite_model(geometry: str) -> Model:
             "v": v + dv,
             "r_nominal": nominal[0],
             "v_nominal": nominal[1],
-            "pitch": kept * x["pitch"] + turn[0],
-            "roll": kept * x["roll"] + turn[1],
+            "pitch": turned[0],
+            "roll": turned[1],
+            "delta_theta_b": ca.vertcat(turned - off, 0),
         },
         outputs={
             **x,
@@ -251,6 +258,8 @@ def staring_satellite_model(geometry: str) -> Model:
             "view": ground_view(x["r"], given, geometry),
             "nominal_view": ground_view(x["r_nominal"], given, geometry),
             "off_nadir": off_nadir(x["r_nominal"], given["aim"]),
+            "q_be": from_small_rotation_vector(ca.vertcat(off, 0)),
+            "delta_v_b": ca.SX.zeros(3),
         },
         step=dt,
         time=time if geometry not in NADIR else None,

@@ -43,7 +43,7 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("frame_georeference", "frame_georeference_printed"),
     *("frame_matcher", "frame_matcher_printed"),
     *("known_pointing", "known_pointing_printed", "target_predict", "target_predict_printed"),
-    *("target_correct", "target_correct_located"),
+    *("target_correct", "target_correct_located", "pointing_correct", "pointing_fix"),
     *("target_correct_misprinted", "target_correct_printed"),
     *("target_evaluation", "target_evaluation_printed"),  # in systems/test_geolocation
 }

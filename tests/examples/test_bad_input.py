@@ -84,11 +84,11 @@ SYSTEM_MISTAKES = {
         "last_known_state, linear, lvlh_attitude, mekf_correct, mekf_predict, "
         "mekf_predict_smoothed, navigation_evaluation, orbit, orbit_evaluation, "
         "orbit_evaluation_considered, orbit_predict, orbit_predict_considered, "
-        "recorded_attitude, recorded_echo, recorded_imu, recorded_orbit, recorded_reference, "
-        "reference_file, scene_echo, staring_camera, staring_satellite, synthetic_sar_fix, "
-        "target_correct, target_correct_located, target_correct_misprinted, "
-        "target_correct_printed, target_evaluation, target_evaluation_printed, "
-        "target_predict, target_predict_printed, terrain",
+        "pointing_correct, pointing_fix, recorded_attitude, recorded_echo, recorded_imu, "
+        "recorded_orbit, recorded_reference, reference_file, scene_echo, staring_camera, "
+        "staring_satellite, synthetic_sar_fix, target_correct, target_correct_located, "
+        "target_correct_misprinted, target_correct_printed, target_evaluation, "
+        "target_evaluation_printed, target_predict, target_predict_printed, terrain",
     ),
     "table that is misspelled": edit(
         "[component.orbit]",

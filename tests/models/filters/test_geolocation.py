@@ -12,10 +12,12 @@ from terrafix.models.filters.geolocation import (
     PRINTED,
     TRACKING,
     known_pointing_model,
+    pointing_fix_model,
     printed_process,
     tracking_process,
 )
 from terrafix.models.filters.process import propagate
+from terrafix.models.geometry.quaternion import from_small_rotation_vector
 from terrafix.models.motion.elements import LOW_ORBIT
 from terrafix.models.sensors.staring import nadir, target_offset
 
@@ -62,11 +64,12 @@ def test_what_the_first_frame_does_not_tell_is_minus_the_target():
     np.testing.assert_array_equal(P[12:], 0.0)
 
 
-def moved(state: ErrorState, process, values, P, steps=1):
+def moved(state: ErrorState, process, values, P, steps=1, given=None):
     """Values and covariance after steps of a second."""
     symbols = {b.name: ca.SX.sym(b.name, b.size) for b in state}
     p = ca.SX.sym("P", state.size, state.size)
-    end = propagate(state, process, symbols, {k: ca.DM(v) for k, v in GIVEN.items()}, 1.0, 1.0)
+    told = {k: ca.DM(v) for k, v in {**GIVEN, **(given or {})}.items()}
+    end = propagate(state, process, symbols, told, 1.0, 1.0)
     f = ca.Function(
         "f", [*symbols.values(), p], [*(end.values[n] for n in symbols), end.covariance(p)]
     )
@@ -106,6 +109,21 @@ def test_noise_of_a_step_is_that_of_a_double_integrator_and_of_gauss_and_markov(
     np.testing.assert_allclose(np.diag(Q)[8:10], 25e-8 * (1 - np.exp(-2 / 600)), rtol=1e-9)
     np.testing.assert_allclose(np.diag(Q)[12:], 0.01 * (1 - np.exp(-1.0)), rtol=1e-9)
     np.testing.assert_array_equal(np.diag(Q)[10:12], 0.0)
+
+
+def test_with_a_gyro_pitch_and_roll_follow_its_increments():
+    """Nothing decays, and the noise is its angle random walk; the star tracker sees both."""
+    values = {"r": R, "v": V, "pitch": 1e-4, "roll": 0, "target": [0, 0]}
+    values |= {"bias": [0, 0], "mismatch": [0, 0]}
+    given = {"delta_theta_b": [1e-5, -2e-5, 0.0], "angle_random_walk": 2e-6}
+    process = tracking_process("sphere", "gyro")
+    end, Q = moved(TRACKING, process, values, np.zeros((14, 14)), given=given)
+    np.testing.assert_allclose([end["pitch"], end["roll"]], [[[1.1e-4]], [[-2e-5]]], rtol=1e-12)
+    np.testing.assert_allclose(np.diag(Q)[8:10], 4e-12, rtol=1e-12)
+    turned = from_small_rotation_vector(ca.DM([3e-4, -1e-4, 0]))
+    fix = pointing_fix_model()(q_be=flat(turned), noise_sigma=2e-5)
+    np.testing.assert_allclose(fix["fix.y"], [3e-4, -1e-4], rtol=1e-6)
+    np.testing.assert_allclose(fix["fix.R"], 4e-10 * np.eye(2))
 
 
 def test_the_printed_target_is_a_random_walk():
