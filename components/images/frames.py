@@ -75,7 +75,7 @@ class _Matching(Component):
     template = Count(WINDOW, minimum=8, doc="rows and columns of a frame that are sought")
     reach = Count(24, minimum=2, maximum=64, doc="largest shift that is looked for [px]")
     noise = Parameter(4.0, minimum=0.0, doc="of a frame's codes: twice that is no texture")
-    least = Parameter(0.7, minimum=-1.0, maximum=1.0, doc="correlation of an accepted match")
+    least = Parameter(0.5, minimum=-1.0, maximum=1.0, doc="correlation of an accepted match")
     match_sigma = Parameter(0.3, unit="px", positive=True, doc="of the match, white")
     texture = Flag(
         False, doc="add to it what the noise of frames makes of a match in their texture"
