@@ -256,20 +256,21 @@ def test_members_alone_and_together_and_resumed_are_the_same_bytes(corrected):
         ((("camera.smear", "[2, 0] px"),), 0.3),
         ((("camera.light_rate", "5e-3 1/s"), ("matcher.method", "ncc")), 0.1),
         ((("matcher.method", "phase"),), 0.3),
-        ((("camera.hidden", "0.1"), ("matcher.method", "phase")), 0.3),
+        ((("camera.hidden", "0.1"),), 0.1),
+        ((("camera.hidden", "0.1"), ("matcher.method", "phase")), 0.1),
         ((("camera.turn_rate", "2e-4 rad/s"),), 0.3),
         ((("camera.stretch_rate", "2e-4 1/s"),), 0.3),
     ],
-    ids=["blur", "smear", "light", "phase", "hidden", "turn", "stretch"],
+    ids=["blur", "smear", "light", "phase", "hidden", "hidden-phase", "turn", "stretch"],
 )
 def test_what_disturbs_images_leaves_parts_of_a_pixel(corrected, settings, worst):
-    """The thesis' future work, one by one; frames that are not matched are refused."""
+    """The thesis' future work, one by one; what hides a part of the ground is left out."""
     system = tf.read_system(corrected, [("scene.spacing", "50 m"), *settings])
     system.record("matches", ["matcher.reason"], period="1")
     data = tf.simulate(system, members=6, duration="30").dataset
     assert rss(data, "image_corrected") < worst
-    # a cloud over a tenth of both images leaves a correlation below 0.5 in a third of the frames
-    assert (data["matcher.reason"].values == 0).mean() > 0.5
+    # without a second look a cloud over a tenth leaves a third of the frames below 0.5
+    assert (data["matcher.reason"].values == 0).mean() > 0.95
 
 
 def test_light_is_what_squares_do_not_stand(corrected):
