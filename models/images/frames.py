@@ -318,7 +318,7 @@ def _masked_surface(
 def _correlation(one: Single, other: Single) -> float:
     """Of two images of one shape, -1 to 1; 0 where one is the same everywhere."""
     a, b = one.ravel(), other.ravel()
-    a, b = a - a.mean(), b - b.mean()
+    a, b = (x - np.add.reduce(x) / x.size for x in (a, b))  # half the time of mean()
     size = float(a @ a) * float(b @ b)
     return float(a @ b) / np.sqrt(size) if size > 0 else 0.0
 
