@@ -59,6 +59,7 @@ benchmarks: $(STAMP)
 	    then $(BIN)/python benchmarks/lake.py; $(BIN)/python benchmarks/integer_contours.py; fi
 	@if test -f "$${TERRAFIX_DATA:-../shared/data}/dem/mark_twain_ndvi_2025.tif"; \
 	    then $(BIN)/python benchmarks/real_lake.py; fi
+	$(BIN)/python benchmarks/geolocation.py
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -177,3 +177,51 @@ RADII: dict[str, Any] = {"shape": (None,), "unit": "m"}
 
 AREAS: dict[str, Any] = {"shape": (None,), "unit": "m^2"}
 """Area of each lake on the ellipsoid, of the rings that are there: its islands less."""
+
+SCENE: dict[str, Any] = {"shape": (None, None), "dtype": np.float32}
+"""An image of the ground: rows, columns."""
+
+SCENE_PLACE: dict[str, Any] = {"shape": (2,), "labels": ("column", "row")}
+"""Column and row of the target in a scene."""
+
+SCENE_GRID: dict[str, Any] = {"shape": (2, 2), "unit": "px/m"}
+"""Columns and rows of a scene by meters north and east."""
+
+WINDOW = 48
+"""Rows and columns that are read out about the middle of a frame."""
+
+FIELD = 192
+"""Rows and columns of the first frame, in which the others are sought."""
+
+WINDOW_IMAGE: dict[str, Any] = {"shape": (WINDOW, WINDOW), "dtype": np.float32}
+FIELD_IMAGE: dict[str, Any] = {"shape": (FIELD, FIELD), "dtype": np.float32}
+
+VIEW: dict[str, Any] = {"shape": (2, 2), "unit": "px/m"}
+"""Pixels north and east in a frame by meters north and east on the ground."""
+
+NORTH_EAST = ("north", "east")
+
+PRINTED_TRACK = {
+    "r": Field((3,), "m", "i", labels=XYZ, doc="position"),
+    "v": Field((3,), "m/s", "i", labels=XYZ, doc="velocity"),
+    "pitch": Field((1,), "rad", doc="error of pointing to the north of the frame"),
+    "roll": Field((1,), "rad", doc="error of pointing to its east"),
+    "target": Field((2,), "px", labels=NORTH_EAST, doc="place of the target in the frame"),
+    "P": Field((10, 10), "1", doc="covariance of the error, in units of its elements"),
+}
+"""What the ten states of the geolocation filter are."""
+
+TRACK = PRINTED_TRACK | {
+    "bias": Field((2,), "px", labels=NORTH_EAST, doc="what the first frame does not tell"),
+    "mismatch": Field((2,), "px", labels=NORTH_EAST, doc="error of matches that lasts"),
+    "P": Field((14, 14), "1", doc="covariance of the error, in units of its elements"),
+}
+"""The same, with what matches to the first frame leave."""
+
+TARGET_FIX = {
+    "y": Field((2,), "px", labels=NORTH_EAST, doc="measured place of the target in the frame"),
+    "from_first": Field((4,), "1", doc="pixels of this frame by pixels of the first one"),
+    "R": Field((2, 2), "1", doc="covariance of the noise of y, in its units"),
+    "present": Field((2,), "1", labels=NORTH_EAST, doc="1 where an element was measured, else 0"),
+}
+"""A fix from one frame."""

@@ -16,6 +16,7 @@ SYSTEM = Path(__file__).parent / "leo_lake.toml"
 STATE = {
     "r": tf.Field((3,), "m", "i", labels=("x", "y", "z")),
     "v": tf.Field((3,), "m/s", "i", labels=("x", "y", "z")),
+    "age": tf.Field((1,), "s"),
     "P": tf.Field((6, 6)),
 }
 FILTERS = {"": ("extended, iterated", "#0072B2", "-"), "ukf_": ("unscented", "#D55E00", "--")}

@@ -19,7 +19,12 @@ def batches(n: int, size: int = 32) -> list[slice]:
 
 
 def over(parts: Iterable[Batch], work: Callable[[Batch], None]) -> None:
-    """Call `work` with every part, on as many threads as there are processors."""
+    """Call `work` with every part, on as many threads as there are processors; one part, here."""
+    parts = list(parts)
+    if len(parts) < 2:
+        for part in parts:
+            work(part)
+        return
     with ThreadPoolExecutor(max_workers=os.cpu_count() or 1) as pool:
         for _ in pool.map(work, parts):
             pass

@@ -40,6 +40,13 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("shore_matcher", "shore_correct", "orbit_evaluation_shore"),  # in systems/test_leo_lake_shore
     *("last_known_orbit", "orbit_evaluation", "orbit_evaluation_considered"),
     *("orbit_predict", "orbit_predict_considered"),  # in systems/test_leo_lake
+    *("ground_scene", "staring_camera", "staring_satellite"),
+    *("frame_georeference", "frame_georeference_printed"),
+    *("frame_matcher", "frame_matcher_printed"),
+    *("known_pointing", "known_pointing_printed", "target_predict", "target_predict_printed"),
+    *("target_correct", "target_correct_located", "pointing_correct", "pointing_fix"),
+    *("target_correct_misprinted", "target_correct_printed"),
+    *("target_evaluation", "target_evaluation_printed"),  # in systems/test_geolocation
 }
 FOREIGN = {"fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
 SIZES = (1, 7, 100)
@@ -273,7 +280,7 @@ def _components(file: Path) -> list[str]:
     tree = ast.parse(file.read_text())
     classes = [n for n in tree.body if isinstance(n, ast.ClassDef) and n.name[0] != "_"]
     bases = ("Component", "SymbolicComponent", "NoisyComponent", "Evaluation", "Playback")
-    bases += ("_Echo", "_Reference")
+    bases += ("_Echo", "_Reference", "_FrameMatcher", "_Georeference", "_KnownPointing")
     # of a filter's own classes
     bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation", "FilterMonitor")
     bases += ("EnsembleCorrect", "Optics")

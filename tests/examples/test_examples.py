@@ -29,6 +29,9 @@ SHORT, FEW = "17", 3  # [s], two fixes; members
 SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
     **dict.fromkeys(("leo_lake", "leo_lake_image", "leo_lake_printed"), "1"),
     "leo_lakes_orbit": "3",
+    **dict.fromkeys(
+        ("geolocation", "geolocation_inertial", "geolocation_pass", "geolocation_printed"), "5"
+    ),
     "spacecraft_sar_closed_loop": "4",
     "spacecraft_sar_real_echo": "4",
 }

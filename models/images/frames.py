@@ -1,0 +1,345 @@
+r"""Frames of a scene, and where one frame lies in another: what a camera that stares gives.
+
+A scene is an image of the ground on a grid of meters north and east. A pixel at :math:`p`, north
+and east of a frame's middle, shows the ground at :math:`V^{-1}(p - t)` from the target, with
+:math:`V` the pixels of a meter and t the target's place in the frame. What blurs all frames alike,
+point spread and motion, blurs the scene once.
+
+A template T of a frame is sought in a larger image S within a gate of shifts s, by one of
+
+.. math::
+    \sum_p (T(p) - S(p + s))^2, \qquad
+    \frac{\sum (T - \bar T)(S_s - \bar S_s)}
+         {\sqrt{\sum (T - \bar T)^2 \sum (S_s - \bar S_s)^2}}, \qquad
+    \mathcal{F}^{-1}\left[ \frac{\hat S \hat T^*}{|\hat S \hat T^*|} \right](s),
+
+the first of which is thrown by a change of light. Between whole pixels the peak is that of a
+parabola through it and its neighbors, along rows and along columns: its error depends on the part
+of a pixel by which the images are shifted, and lasts as long as that does. Where the images differ
+by far in a part of the template (a cloud in one of them), it is sought again without that part.
+
+Images have rows downward, which is south, and columns to the east.
+
+References
+----------
+.. [1] "Satellite-Based Fusion of Image/Inertial Sensors for Precise Geolocation", AFIT thesis,
+       eq. (2.70) and sections 3.4 to 3.6.
+.. [2] C. D. Kuglin, D. C. Hines, "The phase correlation image alignment method", Proc. IEEE
+       Conference on Cybernetics and Society, 1975.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrafix.models.core.arrays import FloatArray, Single
+
+METHODS = ("ssd", "ncc", "phase")
+"""Sum of squared differences, normalized correlation, phase correlation."""
+
+REASONS = (
+    "accepted",
+    "no texture",
+    "the peak lies at the edge of the gate",
+    "the images are not alike",
+    "beyond the edge of the image",
+)
+"""What became of a match."""
+
+LEAST_TEXTURE = 2.0
+"""Standard deviation of a template, at least, in those of its noise: below, nothing is matched."""
+
+_DOUBTFUL = 0.9
+"""Correlation below which a match is looked through for what hides a part of the ground."""
+_OUTLIER, _LEAST_SEEN, _ALL_SEEN = 4.0, 0.4, 0.98
+"""Differences beyond, in robust sigmas, are of what hides it; parts of a template that is seen."""
+_SMOOTH = 1e-6
+_CLOUD = 250.0
+"""Code of a cloud."""
+
+
+def textured_scene(
+    size: int, seed: int, *, middle: float = 128.0, contrast: float = 40.0
+) -> Single:
+    """A scene whose amplitudes fall with frequency, as those of nature do: (size, size) codes.
+
+    Parameters
+    ----------
+    size : int
+        Rows and columns.
+    seed : int
+    middle, contrast : float
+        Mean and standard deviation.
+    """
+    rng = np.random.default_rng(seed)
+    f = np.fft.fftfreq(size)
+    frequency = np.hypot(f[:, None], np.fft.rfftfreq(size))
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.standard_normal((size, size))) / frequency
+    field = np.fft.irfft2(spectrum, (size, size))
+    return np.asarray(middle + contrast * field / field.std(), np.float32)
+
+
+def blurred(scene: Single, sigma: float, motion: tuple[float, float] = (0.0, 0.0)) -> Single:
+    """A scene behind a point spread of a standard deviation, moved while it was exposed [px of it].
+
+    Parameters
+    ----------
+    scene : ndarray of float32, shape (rows, columns)
+    sigma : float
+        Of the Gaussian point spread.
+    motion : (float, float)
+        How far it moves, along rows and along columns: a mean over that line.
+    """
+    result = scene
+    if sigma > 0:
+        spread = cv2.GaussianBlur(result, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+        result = np.asarray(spread, np.float32)
+    length = float(np.hypot(*motion))
+    if length > _SMOOTH:
+        half = int(np.ceil(length / 2)) + 1
+        kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+        for s in np.linspace(-0.5, 0.5, 32 * half):
+            row, column = half + s * motion[0], half + s * motion[1]
+            i, j = int(row), int(column)
+            u, w = row - i, column - j
+            kernel[i : i + 2, j : j + 2] += np.outer((1 - u, u), (1 - w, w)).astype(np.float32)
+        moved = cv2.filter2D(result, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
+        result = np.asarray(moved, np.float32)
+    return result
+
+
+def frame_to_scene(
+    target: ArrayLike, view: ArrayLike, place: ArrayLike, grid: ArrayLike, size: int
+) -> FloatArray:
+    """Affine transforms from (column, row) of frames to (column, row) of a scene, (n, 2, 3).
+
+    Parameters
+    ----------
+    target : array_like, shape (n, 2)
+        Where the target lies in each frame, north and east of its middle [px].
+    view : array_like, shape (n, 2, 2)
+        Pixels by meters north and east [px/m].
+    place : array_like, shape (2,)
+        Column and row of the target in the scene.
+    grid : array_like, shape (2, 2)
+        Columns and rows of the scene by meters north and east [px/m].
+    size : int
+        Rows and columns of the frame.
+    """
+    t, V = np.asarray(target, np.float64), np.asarray(view, np.float64)
+    inverse = np.linalg.inv(V)
+    # (column, row) -> (north, east) in the frame -> meters -> (column, row) of the scene
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    out = np.asarray(grid, np.float64)
+    A = out @ inverse @ turn
+    middle = (size - 1) / 2
+    shift = np.asarray(place) - A.sum(axis=2) * middle - (out @ inverse @ t[..., None])[..., 0]
+    return np.concatenate([A, shift[..., None]], axis=2)
+
+
+def inside(transform: FloatArray, size: int, shape: tuple[int, int]) -> np.ndarray:
+    """Whether frames lie wholly on a scene of a shape, with a pixel to interpolate from: (n,)."""
+    corners = np.array([[0, 0, 1], [size - 1, 0, 1], [0, size - 1, 1], [size - 1, size - 1, 1]])
+    at = np.einsum("nij,kj->nki", transform, corners.astype(np.float64))
+    last = np.array([shape[1], shape[0]]) - 3
+    return np.asarray(((at >= 2) & (at <= last)).all(axis=(1, 2)))
+
+
+def sampled(scene: Single, transform: FloatArray, size: int) -> Single:
+    """A frame (size, size) of a scene, by a transform of `frame_to_scene`; cubic between pixels."""
+    return np.asarray(
+        cv2.warpAffine(
+            scene,
+            transform,
+            (size, size),
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REFLECT,
+        )
+    )
+
+
+def hidden_square(frame: Single, side: int, rng: np.random.Generator) -> None:
+    """Hide a part of a frame behind a bright square of a side [px] somewhere in it, in place."""
+    row, column = (int(rng.integers(0, n - side + 1)) for n in frame.shape)
+    frame[row : row + side, column : column + side] = _CLOUD
+
+
+def coded(frame: Single, noise: float, bits: int, rng: np.random.Generator) -> Single:
+    """A frame with noise [codes], as whole codes from 0 to 2^bits - 1; bits 0: as it is."""
+    if noise > 0:
+        grain = rng.standard_normal(frame.shape, dtype=np.float32)
+        grain *= np.float32(noise)
+        frame = frame + grain
+    if bits:
+        frame = np.rint(frame)
+        np.maximum(frame, 0.0, out=frame)
+        np.minimum(frame, 2**bits - 1, out=frame)
+    return np.asarray(frame, np.float32)
+
+
+@dataclass(frozen=True)
+class FrameMatch:
+    """Where a template lies in an image.
+
+    Parameters
+    ----------
+    row, column : float
+        Shift of the template from the middle of the image [px]; NaN where it was refused.
+    correlation : float
+        Of the template with the image there, -1 to 1; NaN where there is no texture.
+    reason : int
+        Index into `REASONS`; 0 where it was accepted.
+    sigma_row, sigma_column : float
+        What noise of both images makes of the shift in this texture [px]; 0 for phase correlation.
+    """
+
+    row: float
+    column: float
+    correlation: float
+    reason: int
+    sigma_row: float = 0.0
+    sigma_column: float = 0.0
+
+
+def match_frame(
+    template: Single,
+    image: Single,
+    *,
+    method: str = "ssd",
+    subpixel: bool = True,
+    noise: float = 0.0,
+    least: float = 0.5,
+) -> FrameMatch:
+    """Seek a template in an image, at shifts up to half of what the image is larger.
+
+    Parameters
+    ----------
+    template : ndarray of float32, shape (h, w)
+    image : ndarray of float32, shape (h + 2 g, w + 2 k)
+    method : str
+        Of `METHODS`.
+    subpixel : bool
+        Whether to go on between whole pixels.
+    noise : float
+        Standard deviation of the template's noise; `LEAST_TEXTURE` is in its units.
+    least : float
+        Correlation that an accepted match has.
+
+    Raises
+    ------
+    ValueError
+        If `method` is none of `METHODS`, or the template is larger than the image, or differs from
+        it by an odd number of rows or columns.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {METHODS}, got '{method}'")
+    room = [a - b for a, b in zip(image.shape, template.shape, strict=True)]
+    if min(room) < 2 or any(n % 2 for n in room):
+        raise ValueError(
+            f"a template of {template.shape[0]} x {template.shape[1]} pixels cannot be sought in "
+            f"an image of {image.shape[0]} x {image.shape[1]}: the image is larger, evenly on "
+            "all sides"
+        )
+    reach = [n // 2 for n in room]
+    spread = float(cv2.meanStdDev(template)[1][0, 0])
+    if spread <= max(LEAST_TEXTURE * noise, _SMOOTH):
+        return FrameMatch(np.nan, np.nan, np.nan, REASONS.index("no texture"))
+    rows, columns = template.shape
+    surface = _surface(template, image, method)
+    i, j = divmod(int(surface.argmax()), surface.shape[1])
+    found = image[i : i + rows, j : j + columns]
+    alike = _correlation(template, found)
+    if alike < _DOUBTFUL:
+        both = _seen_in_both(template, found)
+        if both is not None:
+            surface = _masked_surface(template, image, method, both)
+            i, j = divmod(int(surface.argmax()), surface.shape[1])
+            alike = _correlation(template[both], image[i : i + rows, j : j + columns][both])
+    if i in (0, 2 * reach[0]) or j in (0, 2 * reach[1]):
+        return FrameMatch(
+            np.nan, np.nan, np.nan, REASONS.index("the peak lies at the edge of the gate")
+        )
+    if not alike >= least:
+        return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
+    row, column = float(i - reach[0]), float(j - reach[1])
+    lines = (surface[:, j], i), (surface[i], j)
+    if subpixel:
+        row, column = (
+            whole + _vertex(*(float(line[at + k]) for k in (-1, 0, 1)))
+            for whole, (line, at) in zip((row, column), lines, strict=True)
+        )
+    unit = {"ssd": 1.0, "ncc": 2.0 * spread * spread * rows * columns, "phase": 0.0}[method]
+    sigmas = (_noise_sigma(line, at, noise, unit, rows * columns) for line, at in lines)
+    return FrameMatch(row, column, alike, 0, *sigmas)
+
+
+def _noise_sigma(score: Single, at: int, noise: float, unit: float, n_pixels: int) -> float:
+    r"""What noise of two images makes of the vertex of a parabola through their score.
+
+    With :math:`q` the sum of squared differences, :math:`b = q_1 - 2 q_0 + q_{-1}`, the vertex has
+    the variance :math:`2 \sigma^2 (q_2 - q_0 + N \sigma^2) / b^2`, where :math:`q_2 - q_0` is
+    :math:`2 b` in a texture that is smooth over two pixels, and less in others.
+    """
+    bend = unit * float(2 * score[at] - score[at - 1] - score[at + 1])
+    if unit == 0.0 or bend <= 0.0:
+        return 0.0
+    fall = 2.0 * bend
+    if 2 <= at < len(score) - 2:
+        fall = min(fall, unit * float(score[at] - (score[at - 2] + score[at + 2]) / 2))
+    return noise * float(np.sqrt(2.0 * (max(fall, 0.0) + n_pixels * noise * noise))) / bend
+
+
+def _seen_in_both(template: Single, found: Single) -> NDArray[np.bool_] | None:
+    """Pixels at which neither image shows what hides the ground; None where that is not a part.
+
+    They differ there by more than `_OUTLIER` robust standard deviations of all differences.
+    """
+    off = template - found
+    off -= np.median(off)
+    both: NDArray[np.bool_] = np.abs(off) <= _OUTLIER * 1.4826 * np.median(np.abs(off))
+    whole = cv2.erode(both.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return whole if _LEAST_SEEN <= whole.mean() < _ALL_SEEN else None
+
+
+def _masked_surface(
+    template: Single, image: Single, method: str, seen: NDArray[np.bool_]
+) -> Single:
+    """Score at every shift of the pixels of a template that are seen, higher where it is better."""
+    kind, sign = (cv2.TM_SQDIFF, -1) if method == "ssd" else (cv2.TM_CCOEFF_NORMED, 1)
+    score = cv2.matchTemplate(image, template, kind, mask=seen.astype(np.float32))
+    return np.asarray(sign * np.nan_to_num(score), np.float32)
+
+
+def _correlation(one: Single, other: Single) -> float:
+    """Of two images of one shape, -1 to 1; 0 where one is the same everywhere."""
+    a, b = one.ravel(), other.ravel()
+    a, b = (x - np.add.reduce(x) / x.size for x in (a, b))  # half the time of mean()
+    size = float(a @ a) * float(b @ b)
+    return float(a @ b) / np.sqrt(size) if size > 0 else 0.0
+
+
+def _surface(template: Single, image: Single, method: str) -> Single:
+    """Score at every shift, higher where it is better."""
+    if method == "ssd":
+        return np.asarray(-cv2.matchTemplate(image, template, cv2.TM_SQDIFF))
+    if method == "ncc":
+        return np.asarray(cv2.matchTemplate(image, template, cv2.TM_CCOEFF_NORMED))
+    (rows, columns), reach = template.shape, (np.array(image.shape) - template.shape) // 2
+    middle = image[reach[0] : reach[0] + rows, reach[1] : reach[1] + columns]
+    window = np.outer(np.hanning(rows), np.hanning(columns)).astype(np.float32)
+    S, T = (np.fft.rfft2((a - a.mean()) * window) for a in (middle, template))
+    cross = S * T.conj()
+    surface = np.fft.irfft2(cross / np.maximum(np.abs(cross), _SMOOTH), (rows, columns))
+    i, j = (np.arange(-r, r + 1) % n for r, n in zip(reach, (rows, columns), strict=True))
+    return np.asarray(surface[np.ix_(i, j)], np.float32)
+
+
+def _vertex(before: float, peak: float, after: float) -> float:
+    """Where a parabola through three values has its vertex, from the middle one."""
+    bend = before - 2 * peak + after
+    return 0.0 if bend >= 0 else min(max((before - after) / (2 * bend), -0.5), 0.5)
