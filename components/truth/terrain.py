@@ -123,4 +123,5 @@ def dem_from(height: Single, grid: FloatArray) -> Dem:
 def scene_from(height: Single, grid: FloatArray, surface: FloatArray) -> Scene:
     """What the ground looks like to a radar, from the ports of a terrain."""
     seed, *strengths = (float(s) for s in surface)
-    return Scene(dem_from(height, grid), int(seed), *strengths)
+    parcels, smooth, fine, density, brightness = strengths
+    return Scene(dem_from(height, grid), int(seed), parcels, smooth, fine, density, brightness)
