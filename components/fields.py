@@ -122,6 +122,7 @@ LOOK = {
     "lake": Field((), "1", doc="number of the lake in its catalog"),
     "sigma": Field((), "px", doc="of the noise of each coordinate of each vertex"),
     "whole": Field((), "1", doc="1 where all of the outline is in the frame, else 0"),
+    "share": Field((), "1", doc="of its vertices, that are in the frame"),
 }
 """What lake an outline is of, and how well it is known."""
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafix.components.fields import CONTOUR, FRAME, LAKE_FIX, LAKE_MOMENTS, LOOK
 from terrafix.cosim.basics.clock import Rate
@@ -24,7 +25,50 @@ NOISES = ("contour", "given")
 """Where their covariance comes from."""
 
 
-class ContourMoments(Component):
+class _WholeLakes(Component):
+    """What takes whole lakes alone: base. A run in which it was never told one says so."""
+
+    look = MessageInput(fields=LOOK, doc="which lake it is, and how well it is seen")
+
+    _BEST: ClassVar[tuple[str, ...]] = ("share", "lake", "t")
+
+    def _initialize_impl(self) -> None:
+        self._best = np.zeros((self.n_members, len(self._BEST)))
+
+    def _extra_state(self) -> dict[str, Any]:
+        return {"best": self._best}
+
+    def _set_extra_state(self, saved: dict[str, Any]) -> None:
+        self._best = saved["best"]
+
+    def terminate(self) -> None:
+        """Say which members were never told a whole lake, and what they were told at best."""
+        super().terminate()
+        flown = self.environment.active
+        rows = flown & (self._best[:, 0] > 0.0) & (self._best[:, 0] < 1.0)
+        n, among = int(rows.sum()), int(flown.sum())
+        if not n or self.step_index == 0:
+            return
+        share, lake, t = self._best[rows][self._best[rows, 0].argmax()]
+        whose = "" if among == 1 else f" in {'any' if n == among else n} of {among} members"
+        _log.warning(
+            "'%s' takes whole lakes, and never was told one%s: at best %.0f %% of the vertices of "
+            "lake %d of the catalog were in the frame, at t = %.4g s\n  fly nearer over it, take a "
+            "wider frame (size, or a shorter focal) or a smaller lake, or match the part of the "
+            "shore that is seen (shore_matcher)",
+            *(self.name, whose, 100 * share, lake, t),
+        )
+
+    def whole(self) -> NDArray[np.bool_]:
+        """Members that are told of a whole lake now."""
+        look = self.look
+        better = look.fresh & (look.share > self._best[:, 0])
+        told = np.stack([look.share, look.lake, look.t], axis=1)
+        self._best[better] = told[better]
+        return np.asarray(look.fresh & (look.whole > 0.5))
+
+
+class ContourMoments(_WholeLakes):
     """Moments of a lake's outline, with the covariance that the noise of its vertices gives them.
 
     An outline that is not wholly in the frame has other moments than the lake, and makes no fix.
@@ -44,7 +88,6 @@ class ContourMoments(Component):
     unbiased = Flag(True, doc="without what the noise of vertices adds to second moments")
 
     contour = MessageInput(**CONTOUR, doc="outline in the frame")
-    look = MessageInput(fields=LOOK, doc="which lake it is of, and how well it is seen")
     fix = MessageOutput(fields=LAKE_FIX, doc="its moments")
 
     def takes(self, name: str) -> bool:
@@ -54,7 +97,7 @@ class ContourMoments(Component):
     def _step_impl(self, t: float, dt: float) -> None:
         contour, look, n, m = self.contour, self.look, self.n_members, len(LAKE_MOMENTS)
         y, R = np.zeros((n, m)), np.tile(np.eye(m), (n, 1, 1))
-        good = contour.fresh & look.fresh & (look.whole > 0.5)
+        good = contour.fresh & self.whole()
         kinds = np.stack([contour.count, look.lake], axis=1)
         for count, lake in np.unique(kinds[good], axis=0):
             rows = np.flatnonzero(good & (kinds == [count, lake]).all(axis=1))
@@ -70,7 +113,7 @@ class ContourMoments(Component):
         self.fix.publish(look.t, valid=good, y=y, R=R, lake=look.lake[:, None], present=present)
 
 
-class ImageMoments(Component):
+class ImageMoments(_WholeLakes):
     """Moments of a lake from an image: of the coverage of its pixels by water, as measured.
 
     An image with no water, or with clouds at the lake's shore, makes no fix. A run of which none
@@ -82,19 +125,20 @@ class ImageMoments(Component):
     blur = Parameter(0.5, unit="px", minimum=0.0, doc="the camera's point spread, as calibrated")
 
     image = MessageInput(**FRAME, doc="codes of the pixels")
-    look = MessageInput(fields=LOOK, doc="which lake it is")
     fix = MessageOutput(fields=LAKE_FIX, doc="its moments")
     clear = Output(doc="1 where the shore was seen whole, 0 where not, NaN without an image")
 
     def _initialize_impl(self) -> None:
+        super()._initialize_impl()
         self.clear = np.nan
         self._images = dict.fromkeys(("told", "dry", "hidden"), 0)
         self._dry = ""
 
     def _extra_state(self) -> dict[str, Any]:
-        return {**self._images, "why": self._dry}
+        return super()._extra_state() | {**self._images, "why": self._dry}
 
     def _set_extra_state(self, saved: dict[str, Any]) -> None:
+        super()._set_extra_state(saved)
         self._images = {name: int(saved[name]) for name in self._images}
         self._dry = str(saved["why"])
 
@@ -114,7 +158,7 @@ class ImageMoments(Component):
     def _step_impl(self, t: float, dt: float) -> None:
         n, m = self.n_members, len(LAKE_MOMENTS)
         y, R = np.zeros((n, m)), np.tile(np.eye(m), (n, 1, 1))
-        told = self.image.fresh & self.look.fresh & (self.look.whole > 0.5)
+        told = self.image.fresh & self.whole()
         good = np.zeros(n, dtype=np.bool_)
         for k in np.flatnonzero(told & self.environment.active):
             blur = float(self.blur[k])

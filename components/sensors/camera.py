@@ -117,45 +117,35 @@ class LakeCamera(Optics):
             self._moved = self.catalog_sigma[:, None, None] * draw
         self._best = np.zeros((n, len(_BEST)))
         self._best[:, _BEST.index("angle")] = np.inf
+        self._has_seen = np.zeros(n, dtype=np.bool_)
 
     def _extra_state(self) -> dict[str, Any]:
-        return {"best": self._best}
+        return {"best": self._best, "has_seen": self._has_seen}
 
     def _set_extra_state(self, saved: dict[str, Any]) -> None:
-        self._best = saved["best"]
+        self._best, self._has_seen = saved["best"], saved["has_seen"]
 
     def terminate(self) -> None:
-        """Say where members never had a lake wholly in the frame, and by how much it was missed."""
+        """Say where members never had a lake in the frame, and by how much it was missed."""
         super().terminate()
         if self.step_index == 0:
             return
-        share = self._best[:, _BEST.index("share")]
-        flown = self.environment.active
-        for rows in (flown & (share == 0.0), flown & (share > 0.0) & (share < 1.0)):
-            if rows.any():
-                _log.warning("'%s' %s", self.name, self._missed(rows))
+        rows = self.environment.active & ~self._has_seen
+        if rows.any():
+            _log.warning("'%s' %s", self.name, self._missed(rows))
 
     def _missed(self, rows: NDArray[np.bool_]) -> str:
-        """What is said of members whose frame never held a whole lake."""
+        """What is said of members whose frame never held a lake."""
         n, whole = int(rows.sum()), int(self.environment.active.sum())
         whose = "" if whole == 1 else f" in {'any' if n == whole else n} of {whole} members"
         best = self._best[rows]
-        columns = {name: best[:, k] for k, name in enumerate(_BEST)}
-        partly = columns["share"].any()
-        of = columns["share"].argmax() if partly else columns["angle"].argmin()
-        share, angle, distance, lake, t = best[of]
+        of = best[:, _BEST.index("angle")].argmin()
+        angle, distance, lake, t = best[of]
         latitude, longitude, _ = geodetic(self.center[int(lake)])
         named = (
             f"lake {int(lake)} of its catalog (latitude {np.degrees(latitude):.2f}, "
             f"longitude {np.degrees(longitude):.2f} deg)"
         )
-        if partly:
-            return (
-                f"never had a lake wholly in the frame{whose}, and moments take a whole one: at "
-                f"best {100 * share:.0f} % of the vertices of {named}, at t = {t:.4g} s\n  fly "
-                "nearer over it, take a wider frame (size, or a shorter focal) or a smaller lake, "
-                "or measure the part of the shore that is seen"
-            )
         far = f"at t = {t:.4g} s, {distance / 1e3:,.0f} km along the ground from the point below"
         corner = np.maximum(self.principal, self.size - self.principal)[rows][of]
         reach = np.degrees(np.arctan(np.linalg.norm(corner) / self.focal[rows][of]))
@@ -177,7 +167,8 @@ class LakeCamera(Optics):
     def _look(self, t: float) -> None:
         n, longest = self.n_members, self._longest
         vertices = np.full((n, MOST_VERTICES, 2), np.nan)
-        count, lake, whole = np.zeros(n, dtype=np.int64), np.zeros(n), np.zeros(n)
+        count = np.zeros(n, dtype=np.int64)
+        lake, whole, share = np.zeros(n), np.zeros(n), np.zeros(n)
         C, o = ground_in_view(*self._own(np.arange(n), t))[:2]
         candidates = self._candidates(C, o)
         noise = np.empty((0, 0, 2))  # drawn only where there is something to see
@@ -192,26 +183,24 @@ class LakeCamera(Optics):
                 complete: NDArray[np.bool_] = np.asarray(inside.all(axis=1))
                 taken = complete | ((count[rows] == 0) & inside.any(axis=1))
                 own, size = rows[taken], pixels.shape[1]
-                self._remember(own, inside[taken].mean(axis=1), number, t)
                 sigma = self.vertex_sigma[own, None, None]
                 vertices[own, :size] = pixels[taken] + sigma * noise[own, :size]
                 count[own], lake[own], whole[own] = size, number, complete[taken]
+                share[own] = inside[taken].mean(axis=1)
+        self._has_seen |= count > 0
         self.contour.publish(t, vertices, count=count, valid=count > 0)
-        self.look.publish(t, valid=count > 0, lake=lake, sigma=self.vertex_sigma, whole=whole)
+        self.look.publish(
+            t, valid=count > 0, lake=lake, sigma=self.vertex_sigma, whole=whole, share=share
+        )
         self._remember_nearest(C, o, t)
-
-    def _remember(self, rows: NDArray[np.int64], share: FloatArray, lake: int, t: float) -> None:
-        better = share > self._best[rows, _BEST.index("share")]
-        told = np.stack([share, *np.broadcast_arrays(0.0, 0.0, lake, t, share)[:4]], axis=1)
-        self._best[rows[better]] = told[better]
 
     def _remember_nearest(self, C: FloatArray, o: FloatArray, t: float) -> None:
         """Of members that had no lake in the frame so far, what came nearest to it."""
-        blind = np.flatnonzero(self.environment.active & (self._best[:, 0] == 0.0))
+        blind = np.flatnonzero(self.environment.active & ~self._has_seen)
         lake, angle, distance = nearest_to_axis(C[blind], o[blind], self.center)
         near = angle + distance / EARTH.radius  # pi for all that are below the horizon
-        before = self._best[blind, 1] + self._best[blind, 2] / EARTH.radius
-        told = np.stack([np.zeros(len(blind)), angle, distance, lake, np.full(len(blind), t)], 1)
+        before = self._best[blind, 0] + self._best[blind, 1] / EARTH.radius
+        told = np.stack([angle, distance, lake, np.full(len(blind), t)], axis=1)
         self._best[blind[near < before]] = told[near < before]
 
     def _own(self, rows: NDArray[np.int64], t: float) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -252,9 +241,9 @@ class LakeCamera(Optics):
 
 _NEAREST = 4
 """Lakes that are looked at in one frame."""
-_BEST = ("share", "angle", "distance", "lake", "t")
-"""What a member had at best: a share of a lake's vertices in the frame; before, the nearest lake's
-angle off the axis [rad] and distance on the ground [m]; which lake, and when [s]."""
+_BEST = ("angle", "distance", "lake", "t")
+"""What came nearest to a member's frame: its angle off the axis [rad] and distance on the ground
+[m]; which lake, and when [s]."""
 
 
 class LakeImager(Component):

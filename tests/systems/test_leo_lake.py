@@ -190,12 +190,14 @@ def test_a_lake_that_the_frame_always_cuts_is_said_with_the_share_that_was_seen(
     system.record("looks", [system.find("camera")["contour"]], period="0.1")
     result = tf.simulate(system, members=1, duration="1")
     (said,) = warnings(caplog)
-    share = int(re.search(r"a whole one: at best (\d+) % of the vertices of lake 0", said)[1])
+    share = int(
+        re.search(r"never was told one: at best (\d+) % of the vertices of lake 0", said)[1]
+    )
     seen = result.dataset["camera.contour"].values[1:, 0, :120]
     inside = ((seen > -0.5) & (seen < np.array([320, 50]) - 0.5)).all(axis=-1).mean(axis=1)
     assert share == pytest.approx(100 * inside.max(), abs=2)  # some are noise of 0.25 px over it
     assert 0 < share < 100
-    assert "measure the part of the shore that is seen" in said
+    assert "match the part of the shore that is seen (shore_matcher)" in said
 
 
 def test_members_that_saw_a_lake_are_not_complained_of_nor_is_a_run_that_goes_on(outline, caplog):
