@@ -280,7 +280,8 @@ def _components(file: Path) -> list[str]:
     tree = ast.parse(file.read_text())
     classes = [n for n in tree.body if isinstance(n, ast.ClassDef) and n.name[0] != "_"]
     bases = ("Component", "SymbolicComponent", "NoisyComponent", "Evaluation", "Playback")
-    bases += ("_Echo", "_Reference", "_FrameMatcher", "_Georeference", "_KnownPointing", "_WholeLakes")
+    bases += ("_Echo", "_Reference", "_FrameMatcher", "_Georeference", "_KnownPointing")
+    bases += ("_WholeLakes",)
     # of a filter's own classes
     bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation", "FilterMonitor")
     bases += ("EnsembleCorrect", "Optics")
