@@ -66,6 +66,37 @@ def geodetic_from_ecef(
     Three scalars. Holds for distances from the center above 100 km; on the polar axis the
     longitude is zero.
     """
+    p, up, out, height = _bowring(r_e, radius, flattening)
+    longitude = ca.atan2(r_e[1], ca.if_else(_on_axis(p), 1.0, r_e[0]))
+    return ca.atan2(up, out), longitude, height
+
+
+def north_east_down(
+    r_e: Any, radius: Any = EARTH.radius, flattening: Any = EARTH.flattening
+) -> Any:
+    """Transformation (3, 3) from Earth-fixed to local level axes, sine of latitude, height [m].
+
+    Of an Earth-fixed position (3,) [m], as `geodetic_from_ecef`, without trigonometry; rows are
+    north, east and down.
+    """
+    p, up, out, height = _bowring(r_e, radius, flattening)
+    length = ca.sqrt(up * up + out * out)
+    sin, cos = up / length, out / length
+    east_x, east_y = -r_e[1] / p, ca.if_else(_on_axis(p), 1.0, r_e[0] / p)
+    axes = ca.vertcat(
+        ca.horzcat(-sin * east_y, sin * east_x, cos),
+        ca.horzcat(east_x, east_y, 0),
+        ca.horzcat(-cos * east_y, cos * east_x, -sin),
+    )
+    return axes, sin, height
+
+
+def _on_axis(p: Any) -> Any:
+    return p <= ca.sqrt(_TINY)
+
+
+def _bowring(r_e: Any, radius: Any, flattening: Any) -> Any:
+    """Distance from the axis [m], direction of the vertical (up, out), any length, and height."""
     x, y, z = r_e[0], r_e[1], r_e[2]
     e2 = flattening * (2 - flattening)
     polar_radius = radius * (1 - flattening)
@@ -80,9 +111,7 @@ def geodetic_from_ecef(
     length = ca.sqrt(up * up + out * out)
     sin_lat, cos_lat = up / length, out / length
     height = p * cos_lat + z * sin_lat - radius * ca.sqrt(1 - e2 * sin_lat * sin_lat)
-    on_axis = p <= ca.sqrt(_TINY)
-    longitude = ca.atan2(y, ca.if_else(on_axis, 1.0, x))
-    return ca.atan2(up, out), longitude, height
+    return p, up, out, height
 
 
 def ellipsoid_intersection(

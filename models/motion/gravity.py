@@ -1,7 +1,12 @@
-r"""Accelerations of a satellite: central gravity, oblateness, drag.
+r"""Accelerations: of a satellite central gravity, oblateness, drag; near the ground normal gravity.
 
 Central gravity and the second zonal harmonic are symmetric about the polar axis, so the same
 expressions hold for inertial and Earth-fixed components.
+
+References
+----------
+.. [1] NIMA TR8350.2, "Department of Defense World Geodetic System 1984", 3rd edition, 2000,
+       eqs. (4-1) and (4-3), tables 3.3 and 3.4.
 """
 
 from __future__ import annotations
@@ -11,10 +16,17 @@ from typing import Any
 
 import casadi as ca
 
+from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import earth_rate_cross
 
 GRAVITY_MODELS = ("two-body", "j2")
 """Names taken by `gravity_acceleration`."""
+
+STANDARD_GRAVITY = 9.80665
+"""[m/s^2], CGPM 1901."""
+
+GRAVITY_EQUATOR, GRAVITY_POLE = 9.7803253359, 9.8321849378
+"""Normal gravity on the ellipsoid [m/s^2], table 3.4 of [1]_."""
 
 _TINY = 1e-300
 
@@ -107,3 +119,33 @@ def earth_fixed_acceleration(
     g = gravity_acceleration(gravity)(r, mu, radius, j2)
     turned = earth_rate_cross(rotation_rate, r)
     return g - 2 * earth_rate_cross(rotation_rate, v) - earth_rate_cross(rotation_rate, turned)
+
+
+def normal_gravity(sin_latitude: Any, height: Any) -> Any:
+    r"""Normal gravity [m/s^2] of WGS-84, centrifugal acceleration included.
+
+    Somigliana's formula on the ellipsoid, and its series to the second power of height,
+
+    .. math::
+        \gamma = \gamma_e \frac{1 + k \sin^2\varphi}{\sqrt{1 - e^2 \sin^2\varphi}}
+            \left[ 1 - \frac{2}{a} (1 + f + m - 2 f \sin^2\varphi)\, h
+                + \frac{3}{a^2} h^2 \right], \quad
+        k = \frac{b \gamma_p}{a \gamma_e} - 1, \quad m = \frac{\omega^2 a^2 b}{\mu},
+
+    eqs. (4-1) and (4-3) of [1]_. Its direction is taken as that of the ellipsoid's normal; true
+    normal gravity turns north with height, by 8e-9 m/s^2 for each meter at 45 degrees.
+
+    Parameters
+    ----------
+    sin_latitude : SX or float
+        Of geodetic latitude.
+    height : SX or float
+        Above the ellipsoid [m]; the series holds to some 20 km.
+    """
+    a, b, f = EARTH.radius, EARTH.polar_radius, EARTH.flattening
+    squared = sin_latitude * sin_latitude
+    k = b * GRAVITY_POLE / (a * GRAVITY_EQUATOR) - 1
+    m = EARTH.rotation_rate**2 * a * a * b / EARTH.mu
+    on_ellipsoid = GRAVITY_EQUATOR * (1 + k * squared) / ca.sqrt(1 - f * (2 - f) * squared)
+    linear = -2 / a * (1 + f + m - 2 * f * squared)
+    return on_ellipsoid * (1 + height * (linear + 3 / (a * a) * height))

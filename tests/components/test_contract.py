@@ -78,6 +78,10 @@ INPUTS = {
 SETTINGS = {
     "antenna_mount": {"misalignment_sigma0": 1e-3, "misalignment_walk": 1e-4},
     "attitude_sensor": {"noise_sigma": 1e-4, "bias_sigma": 1e-3},
+    "flight": {
+        "turbulence": "dryden",
+        "segments": [{"duration": "4 s"}, {"turn": "20 deg", "bank": "30 deg"}],
+    },
     "imu": {
         "velocity_random_walk": 1e-5,
         "accel_bias_sigma0": 1e-4,
@@ -149,14 +153,26 @@ def recording(tmp_path_factory):
     return folder / "recording.nc"
 
 
+@pytest.fixture(scope="module")
+def track(tmp_path_factory):
+    """What a recorded flight follows: a slow turn over 8 s."""
+    path = tmp_path_factory.mktemp("track") / "track.csv"
+    rows = [(t, 47 + 6e-4 * t, 8 + 1e-5 * t * t, 1000 + t) for t in range(9)]
+    lines = ["time,latitude,longitude,height", *(",".join(map(str, row)) for row in rows)]
+    path.write_text("\n".join(lines))
+    return path
+
+
 @pytest.fixture(params=[n for n in TYPES if n not in IMAGING | FOREIGN])
-def build(request, recording):
+def build(request, recording, track):
     """A function that builds a system of one component and what drives it."""
     kind = component_type(request.param)
     settings = dict(SETTINGS.get(request.param, {}))
     for name, value in (("result_file", recording), ("orbit_file", recording)):
         if name in kind.settings():
             settings |= {name: value, "source": "original"}
+    if "track_file" in kind.settings():
+        settings["track_file"] = track
 
     def build_system() -> System:
         system = System("contract")
