@@ -1,12 +1,22 @@
-"""Navigation evaluation: errors against truth, NEES and NIS of the spacecraft filter."""
+"""Navigation evaluation: errors against truth, NEES and NIS of each system's filter."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from terrafix.components.judges.filter_evaluation import FilterEvaluation
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.parameters import Choice
+from terrafix.models.filters.error_state import Values
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
+from terrafix.models.filters.navigator import (
+    NAVIGATOR,
+    altimeter_observation,
+    shift_observation,
+)
 from terrafix.models.filters.shore import shore_observation
 from terrafix.models.filters.spacecraft import STATE, sar_observation
+from terrafix.models.motion.strapdown import EARTHS, level_axes
 
 
 class NavigationEvaluation(FilterEvaluation):
@@ -35,3 +45,28 @@ class ConsideredOrbitEvaluation(OrbitEvaluation):
     """The same of a filter that considers the camera's misalignment and the catalog's scale."""
 
     error_state, observation = CONSIDERED, lake_observation(CONSIDERED)
+
+
+class InertialEvaluation(FilterEvaluation):
+    """Errors of an aircraft's navigator in north, east and down, NEES, and what became of fixes."""
+
+    default_rate = Rate("1")
+    error_state = NAVIGATOR
+    observations = {  # noqa: RUF012
+        "altimeter": altimeter_observation("wgs84"),
+        "radar": shift_observation("wgs84"),
+    }
+    called = {  # noqa: RUF012
+        "r_e": "position",
+        "v_e": "velocity",
+        "q_be": "attitude",
+        "accel_bias_b": "accel_bias",
+        "gyro_bias_b": "gyro_bias",
+    }
+    turned = dict.fromkeys(("r_e", "v_e", "q_be"), ("n", "north", "east", "down"))
+
+    earth = Choice(EARTHS, "wgs84", doc="that of the motion")
+
+    def rotation(self, truth: Values) -> Any:
+        """Transformation (3, 3) from e to north, east, down at the true position."""
+        return level_axes(truth["r_e"], self.setting("earth"))
