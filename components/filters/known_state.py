@@ -10,7 +10,7 @@ from terrafix.cosim.declare.ports import Input, MessageOutput
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
 from terrafix.models.filters.lake import ORBIT
-from terrafix.models.filters.navigator import NAVIGATOR
+from terrafix.models.filters.navigator import DRIFTING
 from terrafix.models.motion.known_state import known_flight_model, known_state_model
 from terrafix.models.motion.strapdown import EARTHS
 
@@ -70,7 +70,7 @@ class LastKnownFlight(SymbolicComponent):
     v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
     q_be = Input((4,), unit="1", frame="b", doc="true attitude, e to body")
     state = MessageOutput(
-        fields=start_fields(NAVIGATOR, ("r_e", "v_e", "q_be")), doc="state and covariance at t = 0"
+        fields=start_fields(DRIFTING, ("r_e", "v_e", "q_be")), doc="state and covariance at t = 0"
     )
 
     def build_model(self) -> Model:

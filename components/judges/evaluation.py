@@ -7,9 +7,11 @@ from typing import Any
 from terrafix.components.judges.filter_evaluation import FilterEvaluation
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice
+from terrafix.models.filters.contours import clearance_observation
 from terrafix.models.filters.error_state import Values
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
 from terrafix.models.filters.navigator import (
+    DRIFTING,
     NAVIGATOR,
     altimeter_observation,
     shift_observation,
@@ -47,22 +49,22 @@ class ConsideredOrbitEvaluation(OrbitEvaluation):
     error_state, observation = CONSIDERED, lake_observation(CONSIDERED)
 
 
+_INERTIAL = {
+    "r_e": "position",
+    "v_e": "velocity",
+    "q_be": "attitude",
+    "accel_bias_b": "accel_bias",
+    "gyro_bias_b": "gyro_bias",
+}
+
+
 class InertialEvaluation(FilterEvaluation):
-    """Errors of an aircraft's navigator in north, east and down, NEES, and what became of fixes."""
+    """Errors of an aircraft's navigator in north, east and down, NEES, and the altimeter's fixes."""
 
     default_rate = Rate("1")
-    error_state = NAVIGATOR
-    observations = {  # noqa: RUF012
-        "altimeter": altimeter_observation("wgs84"),
-        "radar": shift_observation("wgs84"),
-    }
-    called = {  # noqa: RUF012
-        "r_e": "position",
-        "v_e": "velocity",
-        "q_be": "attitude",
-        "accel_bias_b": "accel_bias",
-        "gyro_bias_b": "gyro_bias",
-    }
+    error_state = DRIFTING
+    observations = {"altimeter": altimeter_observation("wgs84")}  # noqa: RUF012
+    called = _INERTIAL
     turned = dict.fromkeys(("r_e", "v_e", "q_be"), ("n", "north", "east", "down"))
 
     earth = Choice(EARTHS, "wgs84", doc="that of the motion")
@@ -70,3 +72,31 @@ class InertialEvaluation(FilterEvaluation):
     def rotation(self, truth: Values) -> Any:
         """Transformation (3, 3) from e to north, east, down at the true position."""
         return level_axes(truth["r_e"], self.setting("earth"))
+
+
+class ContourEvaluation(InertialEvaluation):
+    """The same where contours of the terrain are matched, too."""
+
+    observations = {  # noqa: RUF012
+        **InertialEvaluation.observations,
+        "contour": clearance_observation(DRIFTING, "wgs84"),
+    }
+
+
+class RadarInertialEvaluation(InertialEvaluation):
+    """The same of a navigator with a radar."""
+
+    error_state = NAVIGATOR
+    observations = {  # noqa: RUF012
+        **InertialEvaluation.observations,
+        "radar": shift_observation("wgs84"),
+    }
+
+
+class RadarContourEvaluation(RadarInertialEvaluation):
+    """The same of a navigator with a radar that matches contours of the terrain, too."""
+
+    observations = {  # noqa: RUF012
+        **RadarInertialEvaluation.observations,
+        "contour": clearance_observation(NAVIGATOR, "wgs84"),
+    }

@@ -44,9 +44,11 @@ from terrafix.models.motion.strapdown import gravity, rotation_rate
 APERTURE = "aperture"
 """The instant of the clones: an aperture's center."""
 
+DRIFTING = ErrorState(*INERTIAL, vector("altimeter_bias", 1, unit="m"))
+"""What an aircraft without a radar estimates."""
+
 NAVIGATOR = ErrorState(
-    *INERTIAL,
-    vector("altimeter_bias", 1, unit="m"),
+    *DRIFTING,
     vector("range_bias", 1, unit="m"),
     vector("cross_range_bias", 1, unit="m"),
     *(clone(block, APERTURE) for block in INERTIAL[:2]),
@@ -66,15 +68,23 @@ CENTER = "t_center"
 """Field of a fix: the time of its aperture's center [s]."""
 
 
-def navigator_process(earth: str) -> Process:
-    """Strapdown mechanization on an Earth ("wgs84", "flat"), biases that are Gauss-Markov.
+def navigator_process(state: ErrorState, earth: str) -> Process:
+    """Strapdown mechanization on an Earth, biases that are Gauss-Markov.
+
+    Parameters
+    ----------
+    state : ErrorState
+        `DRIFTING` or `NAVIGATOR`.
+    earth : {"wgs84", "flat"}
 
     Raises
     ------
     ValueError
         If the Earth is not known.
     """
-    return inertial_process(NAVIGATOR, earth, decays=DECAYS)
+    names = [block.name for block in state]
+    decays = {name: parameters for name, parameters in DECAYS.items() if name in names}
+    return inertial_process(state, earth, decays=decays)
 
 
 def height_of(r_e: Any, earth: str) -> Any:
