@@ -11,7 +11,7 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.parameters import Choice, Parameter
+from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import Input, MessageOutput, Output, SharedInput
 from terrafix.models.core.model import Model
 from terrafix.models.filters.contours import ORIGIN, clearance_observation, dem_of, geodetic_of
@@ -50,6 +50,7 @@ class RadarAltimeter(Component):
 
     default_rate = Rate("1", offset="1")
 
+    on = Flag(True, doc="whether it measures")
     earth = Choice(EARTHS, "wgs84", doc="that of the motion")
     sigma = Parameter(5.0, unit="m", positive=True, doc="white noise")
     latitude0 = Parameter(0.0, unit="rad", minimum=-_POLE, maximum=_POLE, doc="origin (flat)")
@@ -67,9 +68,12 @@ class RadarAltimeter(Component):
         return super().takes(name) and (name not in ORIGIN or self.setting("earth") == "flat")
 
     def _initialize_impl(self) -> None:
-        self._check_track(self._clearance(), "at t = 0")
+        if self.on:
+            self._check_track(self._clearance(), "at t = 0")
 
     def _step_impl(self, t: float, dt: float) -> None:
+        if not self.on:
+            return
         clearance = self._clearance()
         self._check_track(clearance, f"at t = {t:g} s")
         y = np.nan_to_num(clearance) + self.sigma * self.normals("noise", 1)[:, 0]

@@ -8,7 +8,7 @@ from terrafix.components.fields import XYZ
 from terrafix.components.filters.family import estimate_fields, fix_fields
 from terrafix.components.noisy import NoisyComponent
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.declare.parameters import Choice, Parameter
+from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import BundleInput, Input, MessageInput, MessageOutput, Output
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.fields import Field
@@ -53,6 +53,7 @@ class SyntheticShift(NoisyComponent):
     default_rate = Rate("0.5", offset="0.5")
 
     earth = Choice(EARTHS, "wgs84", doc="that of the motion")
+    on = Flag(True, doc="whether it sends fixes")
     looks = Choice(LOOKS, "right", doc="side that apertures look to")
     rows = Choice(ROWS, "shift", doc="what is measured: with what map drift reads, or without")
     ground_range = Parameter(1200.0, unit="m", positive=True, doc="of the point, level")
@@ -83,4 +84,4 @@ class SyntheticShift(NoisyComponent):
 
     def build_model(self) -> Model:
         """Build the model for the chosen Earth, looks and rows."""
-        return synthetic_shift_model(*(self.setting(n) for n in ("earth", "looks", "rows")))
+        return synthetic_shift_model(*(self.setting(n) for n in ("earth", "looks", "rows", "on")))

@@ -62,7 +62,9 @@ def aperture_model() -> Model:
     )
 
 
-def synthetic_shift_model(earth: str = "wgs84", looks: str = "right", rows: str = "shift") -> Model:
+def synthetic_shift_model(
+    earth: str = "wgs84", looks: str = "right", rows: str = "shift", on: bool = True
+) -> Model:
     """A fix without an image: what an aperture measures about a known point on the ground.
 
     Parameters
@@ -70,6 +72,8 @@ def synthetic_shift_model(earth: str = "wgs84", looks: str = "right", rows: str 
     earth : {"wgs84", "flat"}
     looks : {"right", "left", "in-turn"}
     rows : {"shift", "shift-and-drift"}
+    on : bool
+        Whether it sends fixes at all.
 
     Returns
     -------
@@ -132,6 +136,7 @@ def synthetic_shift_model(earth: str = "wgs84", looks: str = "right", rows: str 
     present = ca.vertcat(ca.SX.ones(measured), ca.SX.zeros(3 - measured))
     sent = ca.logic_and(ca.logic_not(at_center), own["count"] > 0.5)
     sent = ca.logic_and(sent, _banked(r, q, earth) <= ca.sin(parameters["largest_bank"]))
+    sent = ca.logic_and(sent, on)
     given = {
         "y": (y + errors) * present,
         "p_t_e": p_t,
@@ -143,7 +148,7 @@ def synthetic_shift_model(earth: str = "wgs84", looks: str = "right", rows: str 
         "present": present,
     }
     return Model(
-        f"synthetic_shift_{earth}_{looks}_{rows}".replace("-", "_"),
+        f"synthetic_shift_{earth}_{looks}_{rows}{'' if on else '_off'}".replace("-", "_"),
         inputs=inputs,
         states=own,
         parameters=parameters,
