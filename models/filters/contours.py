@@ -93,7 +93,7 @@ def clearance_observation(state: ErrorState, earth: str) -> EnsembleObservation:
 
     def derivative(estimate: Arrays, told: Arrays) -> NDArray[Any]:
         dem, latitude, longitude, _ = where(estimate, told)
-        north, east = _scales(latitude)
+        north, east = _scales(latitude if rotation_rate(earth) else told[ORIGIN[0]].reshape(-1))
         by_level = np.stack(
             [
                 -_rise(dem, latitude, longitude, dem.latitude_step, 0.0) / north,

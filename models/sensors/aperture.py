@@ -16,7 +16,7 @@ import casadi as ca
 from terrafix.models.core.model import Model
 from terrafix.models.filters.navigator import CENTER, height_of, shift_of
 from terrafix.models.geometry.quaternion import from_rotation_vector, rotation_matrix
-from terrafix.models.motion.strapdown import level_axes, rotation_rate
+from terrafix.models.motion.strapdown import at_end, level_axes, rotation_rate
 from terrafix.models.sensors.altimeter import wandering
 
 LOOKS = ("right", "left", "in-turn")
@@ -44,7 +44,7 @@ def aperture_model() -> Model:
     since = time - index * length
     first = since < 1.5 * dt
     turned = ca.mtimes(rotation_matrix(from_rotation_vector(dtheta)), gained)
-    following = ca.if_else(first, 0.0, turned) + dv
+    following = ca.if_else(first, 0.0, turned) + at_end(dv, dtheta)
     at_center = ca.logic_and(dt > 0, ca.fabs(since - length / 2) < dt / 2)
     return Model(
         "aperture",
