@@ -60,8 +60,12 @@ class LastKnownFlight(SymbolicComponent):
     default_rate = Rate(times=["0"])
 
     earth = Choice(EARTHS, "wgs84", doc="that of the motion")
-    position_sigma = Parameter([3.0, 1.0, 3.0], shape=(3,), unit="m", positive=True, frame="n")
-    velocity_sigma = Parameter([0.1] * 3, shape=(3,), unit="m/s", positive=True, frame="n")
+    position_sigma = Parameter(
+        [3.0, 1.0, 3.0], shape=(3,), unit="m", positive=True, frame="n", doc="north, east, down"
+    )
+    velocity_sigma = Parameter(
+        [0.1] * 3, shape=(3,), unit="m/s", positive=True, frame="n", doc="north, east, down"
+    )
     attitude_sigma = Parameter(
         [5e-4, 5e-4, 2e-3], shape=(3,), unit="rad", positive=True, frame="n", doc="tilts, heading"
     )

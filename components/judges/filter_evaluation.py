@@ -74,11 +74,13 @@ class FilterEvaluation(Evaluation):
                 ports[block.name] = Input(
                     truth.fixed_shape, unit=truth.unit, frame=truth.frame, doc="truth"
                 )
-                labels = block.axes if block.size > 1 else ()
-                frame, *labels = cls.turned.get(block.name, (block.frame, *labels))
+                frame, labels = block.frame, block.axes if block.size > 1 else ()
+                if block.name in cls.turned:
+                    frame, *axes = cls.turned[block.name]
+                    labels = tuple(axes)
                 for kind, doc in (("error", "estimate minus truth"), ("sigma", "predicted")):
                     ports[f"{name}_{kind}"] = Output(
-                        (block.size,), unit=block.unit, frame=frame, labels=tuple(labels), doc=doc
+                        (block.size,), unit=block.unit, frame=frame, labels=labels, doc=doc
                     )
             fields = estimate_fields(cls.error_state)
             ports["estimate"] = BundleInput(fields, doc="to be evaluated")
@@ -90,7 +92,9 @@ class FilterEvaluation(Evaluation):
             declare(cls, **ports)
             cls.quantities = tuple(
                 Quantity(
-                    cls.called.get(b.name, b.name), b.unit, cls.turned.get(b.name, ("", *b.axes))[1:]
+                    cls.called.get(b.name, b.name),
+                    b.unit,
+                    cls.turned.get(b.name, ("", *b.axes))[1:],
                 )
                 for b in state
             )
@@ -136,7 +140,7 @@ class FilterEvaluation(Evaluation):
 
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: without a function that is made there."""
-        return {k: v for k, v in super().__getstate__().items() if k != "_turn"}
+        return {k: v for k, v in self.__dict__.items() if k != "_turn"}
 
     def bind(self, environment: Environment) -> None:
         """Begin with the choices of this run."""

@@ -98,8 +98,12 @@ def synthetic_shift_model(
     r_hat, v_hat = ca.SX.sym("r_hat", 3), ca.SX.sym("v_hat", 3)
     fresh, dt, time = (ca.SX.sym(name) for name in ("fresh", "dt", "time"))
     inputs = {
-        **{"r_e": r, "v_e": v, "q_be": q, "center.fresh": fresh},
-        **{"prior.r_e_at_aperture": r_hat, "prior.v_e_at_aperture": v_hat},
+        "r_e": r,
+        "v_e": v,
+        "q_be": q,
+        "center.fresh": fresh,
+        "prior.r_e_at_aperture": r_hat,
+        "prior.v_e_at_aperture": v_hat,
     }
     parameters = {name: ca.SX.sym(name) for name in _PARAMETERS}
     own = {name: ca.SX.sym(name, size) for name, size in _STATES.items()}

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 import terrafix as tf
 from terrafix.components.filters.navigator import RadarInertialPredict, ShiftCorrect
+from terrafix.components.judges.evaluation import RadarInertialEvaluation
 from terrafix.cosim.basics.errors import TerrafixError
 from terrafix.models.filters.models import correct_model
 from terrafix.models.filters.navigator import NAVIGATOR
@@ -104,7 +105,7 @@ def test_looking_to_both_sides_frees_east_and_down_of_the_altimeter():
 
 
 def test_map_drift_is_a_third_row():
-    """North 1.35 m where 2.02 m are left without it, north velocity 0.06 for 0.12 m/s (NOTES B5)."""
+    """North 1.35 m where 2.02 m are left without it, 0.06 for 0.12 m/s (NOTES B5)."""
     flown = Flown(RADAR, ("radar.rows", "shift-and-drift"))
     assert flown.claimed("position") == pytest.approx([1.35, 2.51, 2.58], rel=0.03)
     assert flown.claimed("velocity")[0] == pytest.approx(0.063, abs=0.005)
@@ -157,7 +158,7 @@ class Printed(ShiftCorrect):
 
 
 def test_the_printed_cross_range_is_found_out():
-    """NEES of 18 over 40 (NOTES B4: 61.6 at the end, 110 on average), and N too wide for its sigma."""
+    """NEES of 18 over 40 (NOTES B4: 61.6 at the end, 110 on average), N wider than its sigma."""
     flown = Flown(RADAR, swapped={"correct_shift": Printed(earth="flat")}, members=100)
     assert flown["nees"].mean() > 40
     assert flown["nees"][-1].mean() > 40
@@ -212,7 +213,7 @@ MAP = [  # an error of the elevation model that goes on for 3 s, 210 m
 def nees_without_range_bias(flown):
     """Of the 17 others, at the end."""
     error = np.concatenate(
-        [flown[f"{q.name}_error"][-1] for q in tf_quantities()], axis=1
+        [flown[f"{q.name}_error"][-1] for q in RadarInertialEvaluation.quantities], axis=1
     )
     kept = [k for k in range(18) if k != 16]
     P = flown["covariance"][-1][:, kept][:, :, kept]
@@ -220,14 +221,8 @@ def nees_without_range_bias(flown):
     return np.einsum("ki,ki->k", error, np.linalg.solve(P, error[..., None])[..., 0]).mean()
 
 
-def tf_quantities():
-    from terrafix.components.judges.evaluation import RadarInertialEvaluation
-
-    return RadarInertialEvaluation.quantities
-
-
 def test_an_error_of_the_map_is_a_bias_of_its_length_and_no_white_noise():
-    """Common to neighboring apertures: as white noise it is found out, as a bias of 3 s it is not."""
+    """Common to neighboring apertures: found out as white noise, not as a bias of 3 s."""
     white = Flown(
         RADAR,
         *MAP,
@@ -244,7 +239,7 @@ def test_an_error_of_the_map_is_a_bias_of_its_length_and_no_white_noise():
 
 @pytest.mark.campaign
 def test_ten_minutes_over_relief_stay_bounded():
-    """Horizontal error rms over the last minute, 20 members: kilometers without an aid, not with."""
+    """Horizontal rms over the last minute, 20 members: half a kilometer without an aid."""
     last = {}
     for aids in ("none", "images", "contours", "both"):
         flown = Flown(RELIEF, ("aids", aids), members=20)
@@ -271,10 +266,10 @@ def test_a_flight_that_leaves_the_map_is_refused(setting, said):
         Flown(RELIEF, ("aids", "contours"), setting, members=2, duration="80")
 
 
-def test_apertures_that_nobody_marked_are_told_as_fixes_of_no_instant():
+def test_a_navigator_whose_apertures_nobody_marks_is_refused():
     system = tf.read_system(RADAR)
+    system.remove("aperture")
     with pytest.raises(TerrafixError, match=r"'predict\.aperture' is not connected"):
-        system.remove("aperture")
         tf.simulate(system, members=1, duration="1")
 
 

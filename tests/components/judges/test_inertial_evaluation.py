@@ -14,7 +14,7 @@ def test_quantities_are_level_and_biases_have_no_axes_of_the_earth():
     assert told["position"] == told["attitude"] == ("north", "east", "down")
     assert told["accel_bias"] == ("x", "y", "z")
     assert told["range_bias"] == ("",)
-    assert RadarInertialEvaluation().outputs()["velocity_error"].frame == "n"
+    assert RadarInertialEvaluation().outputs()["velocity_error"].fields[""].frame == "n"
 
 
 @pytest.mark.parametrize("earth", ["wgs84", "flat"])

@@ -137,7 +137,9 @@ def over(altitude, *, latitude=36.3, members=2, flat=None):
     with tf.System("s", duration="2", seed=3) as system:
         start = {"latitude": np.radians(latitude), "longitude": np.radians(-84.25)}
         truth = system.add(Flight(height=altitude, **start), "flight")
-        source = {"source": "jacksboro"} if flat is None else {"source": "flat", "flat_height": flat}
+        source = (
+            {"source": "jacksboro"} if flat is None else {"source": "flat", "flat_height": flat}
+        )
         ground = system.add(Terrain(**source), "terrain")
         sensor = system.add(RadarAltimeter(), "radar_altimeter")
         system.connect(truth["r_e"], sensor["r_e"])

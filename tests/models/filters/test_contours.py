@@ -1,4 +1,4 @@
-"""Clearance over an elevation model: a plane by hand, finite differences, and where none is known."""
+"""Clearance over an elevation model: a plane by hand, finite differences, the unknown."""
 
 import numpy as np
 import pytest

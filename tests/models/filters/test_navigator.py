@@ -72,7 +72,7 @@ def test_rows_are_those_derived_by_hand(earth, squint):
 
     Map drift l' on velocity, +(R/2V) u'[f x] on attitude and +(R/2V) u'C on the accelerometers'
     bias: signs of C_true = (I + [theta x]) C, truth minus estimate. The reading's second part
-    falls with speed, so that l' is 1 + d'a / 2V^2 times itself; Coriolis adds 2 omega R/2V = 0.0016.
+    falls with speed, so that l' is 1 + d'a / 2V^2 times itself; Coriolis adds 0.0016.
     """
     values, given = geometry(earth, squint)
     H, y = derivative(shift_observation(earth), values, given)
@@ -120,7 +120,11 @@ def test_height_is_that_of_the_earth_chosen():
 
 
 def test_an_earth_that_is_none_is_refused():
-    for make in (altimeter_observation, shift_observation, lambda e: navigator_process(DRIFTING, e)):
+    for make in (
+        altimeter_observation,
+        shift_observation,
+        lambda e: navigator_process(DRIFTING, e),
+    ):
         with pytest.raises(ValueError, match="earth must be one of"):
             make("round")
 
