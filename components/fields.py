@@ -192,6 +192,16 @@ CLEARANCE_FIX = {
 }
 """What a radar altimeter measures."""
 
+PLACE_FIX = {
+    "y": Field((2,), "m", labels=("north", "east"), doc="measured"),
+    "p_e": Field((3,), "m", "e", labels=XYZ, doc="place that they count from"),
+    "R": Field((2, 2), "1", doc="covariance of the noise of y, in its units"),
+    "present": Field(
+        (2,), "1", labels=("north", "east"), doc="1 where an element was measured, else 0"
+    ),
+}
+"""What a matched profile measures."""
+
 SHIFT = ("range", "cross_range", "map_drift")
 SHIFT_FIX = {
     "y": Field((3,), ("m", "m", "m/s"), labels=SHIFT, doc="measured"),

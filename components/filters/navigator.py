@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from terrafix.components.fields import GRID, HEIGHT
+from terrafix.components.fields import GRID, HEIGHT, XYZ
 from terrafix.components.filters.ensembles import EnsembleCorrect
 from terrafix.components.filters.family import FilterCorrect, FilterPredict
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Parameter
-from terrafix.cosim.declare.ports import Input, SharedInput
-from terrafix.models.filters.contours import clearance_observation
+from terrafix.cosim.declare.ports import Input, Output, SharedInput
+from terrafix.models.core.model import Model
+from terrafix.models.filters.contours import clearance_observation, place_observation
 from terrafix.models.filters.ensembles import EnsembleObservation
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.navigator import (
@@ -44,7 +47,7 @@ def _time(default: float) -> Parameter:
 class InertialPredict(FilterPredict):
     """Strapdown mechanization between fixes, and the covariance of its error; without a radar.
 
-    Earth-fixed; `level_view` shows it in local level terms.
+    Earth-fixed; a `level_view` of its motion shows it in local level terms.
     """
 
     default_rate = Rate(hz=100)
@@ -67,10 +70,19 @@ class InertialPredict(FilterPredict):
 
     delta_v_b = Input((3,), unit="m/s", frame="b", doc="measured increment, in turning axes")
     delta_theta_b = Input((3,), unit="rad", frame="b", doc="measured increment, in turning axes")
+    r_e = Output((3,), unit="m", frame="e", labels=XYZ, doc="position of the prior")
+    v_e = Output((3,), unit="m/s", frame="e", labels=XYZ, doc="velocity of the prior")
+    q_be = Output((4,), unit="1", frame="b", doc="attitude of the prior, e to body")
 
     def chosen_process(self) -> Process:
         """The process on the chosen Earth."""
         return navigator_process(self.error_state, self.setting("earth"))
+
+    def build_model(self) -> Model:
+        """Build the model of the process; the motion of the prior also stands alone."""
+        model = super().build_model()
+        motion = {name: model.outputs[f"prior.{name}"] for name in TOLD}
+        return replace(model, outputs={**model.outputs, **motion})
 
 
 class RadarInertialPredict(InertialPredict):
@@ -147,3 +159,22 @@ class RadarClearanceCorrect(ClearanceCorrect):
     """The same of a navigator with a radar."""
 
     error_state, observation = NAVIGATOR, clearance_observation(NAVIGATOR, "wgs84")
+
+
+class PlaceCorrect(FilterCorrect):
+    """Correction by a profile that was matched with an elevation model; without a radar."""
+
+    default_rate = Rate("1", offset="1")
+    error_state, observation = DRIFTING, place_observation("wgs84")
+
+    earth = Choice(EARTHS, "wgs84", doc="that of the filter")
+
+    def chosen_observation(self) -> Observation:
+        """What is observed on the chosen Earth."""
+        return place_observation(self.setting("earth"))
+
+
+class RadarPlaceCorrect(PlaceCorrect):
+    """The same of a navigator with a radar."""
+
+    error_state = NAVIGATOR

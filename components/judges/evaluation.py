@@ -7,7 +7,7 @@ from typing import Any
 from terrafix.components.judges.filter_evaluation import FilterEvaluation
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice
-from terrafix.models.filters.contours import clearance_observation
+from terrafix.models.filters.contours import clearance_observation, place_observation
 from terrafix.models.filters.error_state import Values
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
 from terrafix.models.filters.navigator import (
@@ -79,6 +79,7 @@ class ContourEvaluation(InertialEvaluation):
 
     observations = {  # noqa: RUF012
         **InertialEvaluation.observations,
+        "profile": place_observation("wgs84"),
         "contour": clearance_observation(DRIFTING, "wgs84"),
     }
 
@@ -98,5 +99,6 @@ class RadarContourEvaluation(RadarInertialEvaluation):
 
     observations = {  # noqa: RUF012
         **RadarInertialEvaluation.observations,
+        "profile": place_observation("wgs84"),
         "contour": clearance_observation(NAVIGATOR, "wgs84"),
     }

@@ -21,15 +21,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.filters.ensembles import Arrays, EnsembleObservation
-from terrafix.models.filters.error_state import ErrorState
+from terrafix.models.filters.error_state import ErrorState, vector
+from terrafix.models.filters.measurement import Observation
 from terrafix.models.maps.charts import ORIGIN, geodetic_of, level_axes_of, scales_of
 from terrafix.models.maps.dem import Dem
-from terrafix.models.motion.strapdown import rotation_rate
+from terrafix.models.motion.strapdown import level_axes, rotation_rate
 
 SHARED = ("height", "grid")
 """Arrays of an elevation model: heights, and where they lie."""
@@ -94,3 +96,18 @@ def _rise(
     ahead = dem.known_at(latitude + d_lat, longitude + d_lon)
     behind = dem.known_at(latitude - d_lat, longitude - d_lon)
     return np.asarray((ahead - behind) / (2 * (d_lat + d_lon)))
+
+
+def place_observation(earth: str) -> Observation:
+    """Position north and east of a place that the fix tells (``p_e``): of a matched profile.
+
+    Parameters
+    ----------
+    earth : {"wgs84", "flat"}
+    """
+    rotation_rate(earth)
+    return Observation(
+        lambda x, given: ca.mtimes(level_axes(given["p_e"], earth), x["r_e"] - given["p_e"])[:2],
+        {"north": "m", "east": "m"},
+        fields=[vector("p_e", unit="m", frame="e")],
+    )

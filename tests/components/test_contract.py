@@ -41,6 +41,7 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("last_known_orbit", "orbit_evaluation", "orbit_evaluation_considered"),
     *("orbit_predict", "orbit_predict_considered"),  # in systems/test_leo_lake
     "radar_altimeter",  # in sensors/test_aircraft_sensors
+    "profile_matcher",  # in images/test_profile
     "synthetic_shift",  # of apertures that end: in systems/test_aircraft
     *("clearance_correct", "clearance_correct_radar"),  # in filters/test_clearance
 }
@@ -74,6 +75,7 @@ INPUTS = {
     "range_bias": (np.zeros(1), 1.0),
     "cross_range_bias": (np.zeros(1), 1.0),
     "p_t_e": (R_E * 0.9, 100.0),
+    "p_e": (R_E, 100.0),
     "speed": (np.array([7.5e3]), 0.0),
     "f_b": (np.zeros(3), 1e-3),
     "t_center": (np.zeros(1), 0.0),
@@ -306,7 +308,7 @@ def _components(file: Path) -> list[str]:
     bases += ("EnsembleCorrect",)
     abstract = (*bases, "FilterAcquisition", "FilterSensor", "FilterTruth")
     bases += ("LakeCorrect", "MekfPredict", "OrbitEvaluation", "OrbitPredict")
-    bases += ("AltimeterCorrect", "ClearanceCorrect", "InertialPredict")
+    bases += ("AltimeterCorrect", "ClearanceCorrect", "InertialPredict", "PlaceCorrect")
     bases += ("InertialEvaluation", "RadarInertialEvaluation")
     derived = [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
     return [name for name in derived if name not in abstract]
