@@ -50,6 +50,7 @@ benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/closed_loop.py
 	$(BIN)/python benchmarks/filters.py
 	$(BIN)/python benchmarks/verdicts.py
+	$(BIN)/python benchmarks/aircraft.py
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
 	    then $(BIN)/python benchmarks/real_echo.py; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/lakes_gshhg"; \

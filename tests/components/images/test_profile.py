@@ -60,7 +60,7 @@ def test_members_are_found_after_a_profile_and_their_clearances_pass_from_then_o
     assert not passed[: k + 1].any()
     assert passed[k + 1 :].all()
     off = np.linalg.norm(y[k], axis=1)
-    true = np.linalg.norm((data["estimate.r_e"] - data["flight.r_e"]).values[-1], axis=1)
+    true = np.linalg.norm(data["estimate.r_e"].values[-1] - data["flight.r_e"].values[-1], axis=1)
     assert np.abs(off - true).max() < 60.0
     assert true.max() > 300.0
 
