@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from terrafix.components.fields import KNOWN_STATE
 from terrafix.components.filters.family import start_fields
+from terrafix.components.shared import require_earth
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import Input, MessageOutput
@@ -76,6 +77,10 @@ class LastKnownFlight(SymbolicComponent):
     state = MessageOutput(
         fields=start_fields(DRIFTING, ("r_e", "v_e", "q_be")), doc="state and covariance at t = 0"
     )
+
+    def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.r_e)
+        super()._initialize_impl()
 
     def build_model(self) -> Model:
         """Build the model for the chosen Earth."""

@@ -9,6 +9,7 @@ import numpy as np
 from terrafix.components.fields import GRID, HEIGHT, XYZ
 from terrafix.components.filters.ensembles import EnsembleCorrect
 from terrafix.components.filters.family import FilterCorrect, FilterPredict
+from terrafix.components.shared import require_earth
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import Input, Output, SharedInput
@@ -74,6 +75,10 @@ class InertialPredict(FilterPredict):
     v_e = Output((3,), unit="m/s", frame="e", labels=XYZ, doc="velocity of the prior")
     q_be = Output((4,), unit="1", frame="b", doc="attitude of the prior, e to body")
 
+    def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.port_views["start"].r_e)
+        super()._initialize_impl()
+
     def chosen_process(self) -> Process:
         """The process on the chosen Earth."""
         return navigator_process(self.error_state, self.setting("earth"))
@@ -105,6 +110,10 @@ class AltimeterCorrect(FilterCorrect):
 
     earth = Choice(EARTHS, "wgs84", doc="that of the filter")
 
+    def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.port_views["prior"].r_e)
+        super()._initialize_impl()
+
     def chosen_observation(self) -> Observation:
         """What is observed on the chosen Earth."""
         return altimeter_observation(self.setting("earth"))
@@ -123,6 +132,10 @@ class ShiftCorrect(FilterCorrect):
     error_state, observation = NAVIGATOR, shift_observation("wgs84")
 
     earth = Choice(EARTHS, "wgs84", doc="that of the filter")
+
+    def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.port_views["prior"].r_e)
+        super()._initialize_impl()
 
     def chosen_observation(self) -> Observation:
         """What is observed on the chosen Earth."""
@@ -146,6 +159,10 @@ class ClearanceCorrect(EnsembleCorrect):
     height = SharedInput(**HEIGHT, doc="heights of the ground")
     grid = SharedInput(**GRID, doc="where they lie")
 
+    def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.port_views["prior"].r_e)
+        super()._initialize_impl()
+
     def chosen_observation(self) -> EnsembleObservation:
         """What is observed on the chosen Earth."""
         return clearance_observation(self.error_state, self.setting("earth"))
@@ -168,6 +185,10 @@ class PlaceCorrect(FilterCorrect):
     error_state, observation = DRIFTING, place_observation("wgs84")
 
     earth = Choice(EARTHS, "wgs84", doc="that of the filter")
+
+    def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.port_views["prior"].r_e)
+        super()._initialize_impl()
 
     def chosen_observation(self) -> Observation:
         """What is observed on the chosen Earth."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.components.fields import CLEARANCE_FIX, GRID, HEIGHT, PLACE_FIX
+from terrafix.components.shared import require_earth
 from terrafix.components.truth.terrain import dem_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
@@ -68,6 +69,7 @@ class ProfileMatcher(Component):
         self.state_arrays["profile"] = np.zeros((environment.n_members, self.points, 3))
 
     def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.r_e)
         self.reason = np.nan
 
     def _step_impl(self, t: float, dt: float) -> None:

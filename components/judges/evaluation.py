@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from terrafix.components.judges.filter_evaluation import FilterEvaluation
+from terrafix.components.shared import require_earth
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice
 from terrafix.models.filters.contours import clearance_observation, place_observation
@@ -68,6 +69,10 @@ class InertialEvaluation(FilterEvaluation):
     turned = dict.fromkeys(("r_e", "v_e", "q_be"), ("n", "north", "east", "down"))
 
     earth = Choice(EARTHS, "wgs84", doc="that of the motion")
+
+    def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.port_views["r_e"])
+        super()._initialize_impl()
 
     def rotation(self, truth: Values) -> Any:
         """Transformation (3, 3) from e to north, east, down at the true position."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from terrafix.components.fields import CLEARANCE_FIX, GRID, HEIGHT, HEIGHT_FIX
 from terrafix.components.noisy import NoisyComponent
+from terrafix.components.shared import require_earth
 from terrafix.components.truth.terrain import dem_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
@@ -34,6 +35,10 @@ class Altimeter(NoisyComponent):
     r_e = Input((3,), unit="m", frame="e", doc="true position")
     fix = MessageOutput(fields=HEIGHT_FIX, doc="measured height")
     bias = Output((1,), unit="m", doc="true bias")
+
+    def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.r_e)
+        super()._initialize_impl()
 
     def build_model(self) -> Model:
         """Build the model for the chosen Earth."""
@@ -67,6 +72,7 @@ class RadarAltimeter(Component):
         return super().takes(name) and (name not in ORIGIN or self.setting("earth") == "flat")
 
     def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.r_e)
         if self.on:
             self._check_track(self._clearance(), "at t = 0")
 

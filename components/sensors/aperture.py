@@ -6,6 +6,7 @@ import numpy as np
 
 from terrafix.components.fields import MOTION, SHIFT_FIX, XYZ
 from terrafix.components.noisy import NoisyComponent
+from terrafix.components.shared import require_earth
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import BundleInput, Input, MessageInput, MessageOutput, Output
@@ -79,6 +80,10 @@ class SyntheticShift(NoisyComponent):
     fix = MessageOutput(fields=SHIFT_FIX, doc="the fix")
     range_bias = Output((1,), unit="m", doc="true bias of range")
     cross_range_bias = Output((1,), unit="m", doc="true bias of cross-range")
+
+    def _initialize_impl(self) -> None:
+        require_earth(self, self.setting("earth"), self.r_e)
+        super()._initialize_impl()
 
     def build_model(self) -> Model:
         """Build the model for the chosen Earth, looks and rows."""
