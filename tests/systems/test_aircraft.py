@@ -97,6 +97,16 @@ def test_the_real_earth_asks_for_nothing_else(flight):
     assert 17.2 <= real["nees"].mean() <= 18.9
 
 
+def test_an_altimeter_may_have_a_rate_of_its_own(flight):
+    """Ten times as often, between fixes of the radar: down is known better, and as well as said."""
+    parts = ("altimeter", "correct_height", "correct_shift")
+    often = Flown(RADAR, *((f"{n}.{key}", "0.1 s") for n in parts for key in ("period", "offset")))
+    assert (often["altimeter_accepted"][1:] == 1).all()
+    assert (often["radar_accepted"][1:] == 1).all()
+    assert often.claimed("position")[2] < 0.95 * flight.claimed("position")[2]
+    assert 17.2 <= often["nees"].mean() <= 18.9
+
+
 def test_looking_to_both_sides_frees_east_and_down_of_the_altimeter():
     """3 sigma 0.41 m east and 1.45 m down (NOTES B5), where one side leaves 2.5 and 2.6 m."""
     flown = Flown(RADAR, ("radar.looks", "in-turn"))
