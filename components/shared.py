@@ -48,3 +48,23 @@ def shared_setting(component: Component, name: str) -> FloatArray:
     if component.lent is None:
         return np.asarray(component.setting(name))
     return np.asarray(getattr(component, name)[0])
+
+
+def require_earth(component: Component, earth: str, r_e: FloatArray) -> None:
+    """Raise ConfigurationError if positions (n_members, 3) [m] are not of the Earth chosen."""
+    distance = np.linalg.norm(r_e[component.environment.active], axis=1)
+    if not len(distance) or not np.isfinite(distance).any():
+        return
+    far = bool(np.nanmedian(distance) > _BELOW_GROUND)
+    if far == (earth == "wgs84"):
+        return
+    other = "wgs84" if far else "flat"
+    raise ConfigurationError(
+        f"'{component.name}.earth' is {earth}, but the position that it reads is "
+        f"{np.nanmedian(distance) / 1e3:,.0f} km from the origin, as on the Earth '{other}'\n"
+        "  set the same earth in flight, sensors, filter and evaluation"
+    )
+
+
+_BELOW_GROUND = 6.2e6
+"""Distance from the Earth's center that no flight has [m]."""
