@@ -51,7 +51,9 @@ def normalized_square(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
     # axes first: the members of an element side by side
     e, P = e.reshape(-1, n).T, P.reshape(-1, n, n).transpose(1, 2, 0)
     diagonal = P.diagonal().T
-    valid = np.isfinite(e).all(axis=0) & np.isfinite(P).all(axis=(0, 1)) & (diagonal > 0).all(axis=0)
+    valid = (
+        np.isfinite(e).all(axis=0) & np.isfinite(P).all(axis=(0, 1)) & (diagonal > 0).all(axis=0)
+    )
     if not valid.all():
         e, P = np.where(valid, e, 0.0), np.where(valid, P, np.eye(n)[..., None])
         diagonal = P.diagonal().T
