@@ -69,7 +69,10 @@ class KnownPointing(_KnownPointing):
         FIRST_FRAME, "unknown", doc="where the target lies in it: as the filter has it, or measured"
     )
     georeference_sigma = Parameter(
-        0.1, unit="px", positive=True, doc="of the place in the first frame (georeferenced)"
+        0.1,
+        unit="px",
+        positive=True,
+        doc="of the place in the first frame, that lasts: of the map (georeferenced)",
     )
 
     start = MessageOutput(fields=start_fields(TRACKING, _TOLD), doc="estimate at t = 0")

@@ -152,14 +152,20 @@ class _Matching(Component):
             light=self.method != "ssd",
         )
 
-    def _tell(self, port: Any, t: float, y: FloatArray, from_first: FloatArray, told: Mask) -> None:
+    def _covariance(self) -> FloatArray:
+        """R of matches (n, 2, 2)."""
+        return (self.match_sigma[:, None] ** 2 + self._variance)[:, None] * np.eye(2)
+
+    def _tell(
+        self, port: Any, t: float, y: FloatArray, R: FloatArray, from_first: FloatArray, told: Mask
+    ) -> None:
         n = self.n_members
         port.publish(
             t,
             valid=told,
             y=np.where(told[:, None], y, 0.0),
             from_first=from_first.reshape(n, 4),
-            R=(self.match_sigma[:, None] ** 2 + self._variance)[:, None] * np.eye(2),
+            R=R,
             present=np.ones((n, 2)),
         )
 
@@ -263,8 +269,11 @@ class _FrameMatcher(_Matching):
         over(batches(len(rows)), seek)
         moved = -np.einsum("nij,nj->ni", from_first, y)
         told = seen & (self._reasons == 0)
-        self._tell(self.fix, t, moved, from_first, told)
-        self._tell(self.located, t, moved + at, from_first, told & (self.referenced > 0.5))
+        R = self._covariance()
+        self._tell(self.fix, t, moved, R, from_first, told)
+        # the first frame lies in itself without an error, and on the map with that of its reference
+        R = np.where(self.reference.fresh[:, None, None], self.reference.R, R)
+        self._tell(self.located, t, moved + at, R, from_first, told & (self.referenced > 0.5))
         self._say(seen)
 
     def _again(self, m: int, frame: Single, row: float, column: float) -> tuple[float, float]:
@@ -274,8 +283,9 @@ class _FrameMatcher(_Matching):
         for _ in range(_LOOKS):
             i, j = round(row), round(column)
             template = _cut(shifted(frame, row - i, column - j), size)
-            top, left = i + edge - 1, j + edge - 1
-            image = self.field[m, top : top + size + 2, left : left + size + 2]
+            top, left = i + edge - _MARGIN, j + edge - _MARGIN
+            room = size + 2 * _MARGIN
+            image = self.field[m, top : top + room, left : left + room]
             match = self._settled(template, image, m)
             self._keep(m, match)
             row, column = row + match.row, column + match.column
@@ -342,21 +352,22 @@ class _Georeference(_Matching):
                 for _ in range(_LOOKS if self.subpixel and self.again else 0):
                     if self._reasons[m] != 0:
                         break
-                    y[m], moved = self._found(m, y[m], 1)
+                    y[m], moved = self._found(m, y[m])
                     if moved < _STILL:
                         break
 
         over(batches(len(rows)), seek)
         told = seen & (self._reasons == 0)
-        self._tell(self.fix, t, y, np.broadcast_to(np.eye(2), (self.n_members, 2, 2)), told)
+        same = np.broadcast_to(np.eye(2), (self.n_members, 2, 2))
+        self._tell(self.fix, t, y, self._covariance(), same, told)
         self._say(seen)
 
-    def _found(self, m: int, target: FloatArray, gate: int) -> tuple[FloatArray, float]:
-        """Where the target lies in a member's frame, sought about where it is thought to be.
+    def _found(self, m: int, target: FloatArray, gate: int = 0) -> tuple[FloatArray, float]:
+        """Where the target lies in a member's frame, from where it is thought to be, and how far.
 
-        And how far that is from there [px]. In a gate of a pixel by least squares.
+        Sought in a gate, or without one by least squares.
         """
-        size = self.template + 2 * gate
+        size = self.template + 2 * (gate or _MARGIN)
         transform = frame_to_scene(
             target[None], self.nominal_view[m : m + 1], self.place, self.grid, size
         )
@@ -364,7 +375,7 @@ class _Georeference(_Matching):
             self._reasons[m] = REASONS.index("beyond the edge of the image")
             return target, 0.0
         image = sampled(self._map, transform[0], size)
-        seek = self._sought if gate > 1 else self._settled
+        seek = self._sought if gate else self._settled
         match = seek(_cut(self.frame.value[m], self.template), image, m)
         self._keep(m, match)
         off = np.array([match.row, -match.column])

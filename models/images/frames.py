@@ -333,12 +333,15 @@ def _noise_sigma(score: Single, at: int, noise: float, unit: float, n_pixels: in
 def least_squares_shift(
     template: Single, image: Single, *, noise: float = 0.0, least: float = 0.5, light: bool = False
 ) -> FrameMatch:
-    """Shift of a template in an image that is larger by a pixel on all sides, if it is a small one.
+    """Shift of a template in an image that is larger by two pixels on all sides, if it is small.
+
+    Slopes are differences of fourth order: those of second order are too small in fine texture, and
+    tell too large a sigma.
 
     Parameters
     ----------
     template : ndarray of float32, shape (h, w)
-    image : ndarray of float32, shape (h + 2, w + 2)
+    image : ndarray of float32, shape (h + 4, w + 4)
     noise : float
         Standard deviation of the template's noise.
     least : float
@@ -346,13 +349,13 @@ def least_squares_shift(
     light : bool
         Whether mean and contrast may differ.
     """
-    middle = image[1:-1, 1:-1]
-    down, right = (image[2:, 1:-1] - image[:-2, 1:-1]) / 2, (image[1:-1, 2:] - image[1:-1, :-2]) / 2
+    middle, across, along = image[2:-2, 2:-2], image[:, 2:-2], image[2:-2]
+    down = (8 * (across[3:-1] - across[1:-3]) - (across[4:] - across[:-4])) / 12
+    right = (8 * (along[:, 3:-1] - along[:, 1:-3]) - (along[:, 4:] - along[:, :-4])) / 12
     alike, seen = _correlation(template, middle), None
     if alike < _DOUBTFUL:
         seen = _seen_in_both(template, middle)
-    pixels = (template, middle, down, right)
-    T, S, u, v = (x.ravel() if seen is None else x[seen] for x in pixels)
+    T, S, u, v = (x.ravel() if seen is None else x[seen] for x in (template, middle, down, right))
     if seen is not None:
         alike = _correlation(T, S)
     if not alike >= least:
