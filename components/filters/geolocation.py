@@ -72,7 +72,14 @@ class KnownPointing(_KnownPointing):
         0.1,
         unit="px",
         positive=True,
-        doc="of the place in the first frame, that lasts: of the map (georeferenced)",
+        doc="of the place in the first frame: what lasts of its error (georeferenced)",
+    )
+    mismatch_sigma = Parameter(
+        0.0,
+        unit="px",
+        minimum=0.0,
+        doc="of the error of matches that lasts, at the start: none in the first frame itself, "
+        "but on a map",
     )
 
     start = MessageOutput(fields=start_fields(TRACKING, _TOLD), doc="estimate at t = 0")

@@ -67,8 +67,9 @@ REASONS = (
 LEAST_TEXTURE = 2.0
 """Standard deviation of a template, at least, in those of its noise: below, nothing is matched."""
 
-_DOUBTFUL = 0.9
-"""Correlation below which a match is looked through for what hides a part of the ground."""
+_DOUBTFUL, _CLEAR = 0.9, 0.97
+"""Correlations below which a match is looked through for what hides a part of the ground: of a
+search, and of least squares, which a strip of a cloud throws by a tenth of a pixel."""
 _OUTLIER, _LEAST_SEEN, _ALL_SEEN = 4.0, 0.2, 0.98
 """Differences beyond, in robust sigmas, are of what hides it; parts of a template that is seen."""
 _SURE, _SURE_SIGMA = 0.35, 0.4538
@@ -353,11 +354,12 @@ def least_squares_shift(
     down = (8 * (across[3:-1] - across[1:-3]) - (across[4:] - across[:-4])) / 12
     right = (8 * (along[:, 3:-1] - along[:, 1:-3]) - (along[:, 4:] - along[:, :-4])) / 12
     alike, seen = _correlation(template, middle), None
-    if alike < _DOUBTFUL:
+    if alike < _CLEAR:
         seen = _seen_in_both(template, middle)
     T, S, u, v = (x.ravel() if seen is None else x[seen] for x in (template, middle, down, right))
     if seen is not None:
         alike = _correlation(T, S)
+        noise *= float(np.sqrt(2.0))  # pixels are others each time, and the image's noise is, too
     if not alike >= least:
         return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
     if light:
