@@ -61,6 +61,8 @@ REASONS = (
     "the peak lies at the edge of the gate",
     "the images are not alike",
     "beyond the edge of the image",
+    "its parts do not agree",
+    "too much is hidden",
 )
 """What became of a match."""
 
@@ -70,12 +72,15 @@ LEAST_TEXTURE = 2.0
 _DOUBTFUL, _CLEAR = 0.9, 0.97
 """Correlations below which a match is looked through for what hides a part of the ground: of a
 search, and of least squares, which a strip of a cloud throws by a tenth of a pixel."""
-_OUTLIER, _LEAST_SEEN, _ALL_SEEN = 4.0, 0.2, 0.98
+_OUTLIER, _LEAST_SEEN, _ALL_SEEN = 4.0, 0.3, 0.98
 """Differences beyond, in robust sigmas, are of what hides it; parts of a template that is seen."""
 _SURE, _SURE_SIGMA = 0.35, 0.4538
 """So many pixels are seen at least; such a part of a normal distribution lies within, in sigmas."""
 _COARSE = 2
 """Pixels by which a search among hidden ones goes."""
+_DISAGREE = 40.0
+"""What quarters of a template may gain, in squares of what is left: chi-square of 6, whose mean is
+6, and room for what is not white."""
 _TAPS = 4
 """Pixels to either side that tell one between them."""
 _SMOOTH = 1e-6
@@ -356,6 +361,8 @@ def least_squares_shift(
     alike, seen = _correlation(template, middle), None
     if alike < _CLEAR:
         seen = _seen_in_both(template, middle)
+        if seen is not None and seen.mean() < _LEAST_SEEN:
+            return FrameMatch(np.nan, np.nan, alike, REASONS.index("too much is hidden"))
     T, S, u, v = (x.ravel() if seen is None else x[seen] for x in (template, middle, down, right))
     if seen is not None:
         alike = _correlation(T, S)
@@ -374,8 +381,34 @@ def least_squares_shift(
     row, column = (c * down_off - b * right_off) / det, (a * right_off - b * down_off) / det
     if max(abs(row), abs(column)) > 1.0:
         return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
+    if seen is not None and not _parts_agree(template, seen, (T, S, u, v), (row, column)):
+        return FrameMatch(np.nan, np.nan, alike, REASONS.index("its parts do not agree"))
     sigmas = (noise * float(np.sqrt(x / det)) for x in (c, a))
     return FrameMatch(row, column, alike, 0, *sigmas)
+
+
+def _parts_agree(
+    template: Single,
+    seen: NDArray[np.bool_],
+    pixels: tuple[Single, ...],
+    shift: tuple[float, float],
+) -> bool:
+    """Whether quarters of a template, shifted each by itself, leave as much as all together.
+
+    Two clouds that lie alike on two images hold them together where the ground does not.
+    """
+    T, S, u, v = pixels
+    left = T - S - shift[0] * u - shift[1] * v
+    rows, columns = np.nonzero(seen)
+    quarter = 2 * (rows >= template.shape[0] // 2) + (columns >= template.shape[1] // 2)
+    gain = 0.0
+    for k in range(4):
+        here = quarter == k
+        g, off = np.stack([u[here], v[here]]), left[here]
+        A, b = g @ g.T, g @ off
+        if float(np.linalg.det(A)) > _SMOOTH * float(A[0, 0] * A[1, 1]):
+            gain += float(b @ np.linalg.solve(A, b))
+    return gain < _DISAGREE * float(np.mean(left * left))
 
 
 def _hidden_in_part(
@@ -392,7 +425,7 @@ def _hidden_in_part(
     for search in (lambda: at, lambda: _of_sure_pixels(template, image)):
         i, j = search()
         both = _seen_in_both(template, image[i : i + rows, j : j + columns])
-        if both is None:
+        if both is None or both.mean() < _LEAST_SEEN:
             continue
         surface = _masked_surface(template, image, method, both)
         i, j = divmod(int(surface.argmax()), surface.shape[1])
@@ -416,7 +449,7 @@ def _of_sure_pixels(template: Single, image: Single) -> tuple[int, int]:
 
 
 def _seen_in_both(template: Single, found: Single) -> NDArray[np.bool_] | None:
-    """Pixels at which neither image shows what hides the ground; None where that is not a part.
+    """Pixels at which neither image shows what hides the ground; None where that is all.
 
     They differ there by more than `_OUTLIER` standard deviations from the others, which are told by
     the shortest interval that has `_SURE` of all differences.
@@ -429,7 +462,7 @@ def _seen_in_both(template: Single, found: Single) -> NDArray[np.bool_] | None:
     middle, half = (line[at] + line[at + k]) / 2, widths[at] / 2
     both: NDArray[np.bool_] = np.abs(off - middle) <= _OUTLIER / _SURE_SIGMA * half
     whole = cv2.erode(both.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return whole if _LEAST_SEEN <= whole.mean() < _ALL_SEEN else None
+    return whole if whole.mean() < _ALL_SEEN else None
 
 
 def _masked_surface(
