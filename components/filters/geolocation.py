@@ -69,7 +69,17 @@ class KnownPointing(_KnownPointing):
         FIRST_FRAME, "unknown", doc="where the target lies in it: as the filter has it, or measured"
     )
     georeference_sigma = Parameter(
-        0.1, unit="px", positive=True, doc="of the place in the first frame (georeferenced)"
+        0.1,
+        unit="px",
+        positive=True,
+        doc="of the place in the first frame: what lasts of its error (georeferenced)",
+    )
+    mismatch_sigma = Parameter(
+        0.0,
+        unit="px",
+        minimum=0.0,
+        doc="of the error of matches that lasts, at the start: none in the first frame itself, "
+        "but on a map",
     )
 
     start = MessageOutput(fields=start_fields(TRACKING, _TOLD), doc="estimate at t = 0")

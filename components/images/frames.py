@@ -45,10 +45,15 @@ from terrafix.models.images.frames import (
     blurred,
     frame_to_scene,
     inside,
+    least_squares_shift,
     match_frame,
     sampled,
+    shifted,
 )
 
+_LOOKS, _STILL, _EDGE = 4, 1e-3, 4
+"""Times that a frame is shown anew, or until it has not moved so far [px]; what of it is not told
+from all sides then."""
 _SIGMAS, _MARGIN = 4.0, 2
 """The gate: so many predicted sigmas, and so many pixels besides."""
 _BIAS, _MISMATCH = slice(10, 12), slice(12, 14)
@@ -69,7 +74,7 @@ class _Matching(Component):
     subpixel = Flag(True, doc="go on between whole pixels, by parabolas")
     again = Flag(
         True,
-        doc="match a second time, shown anew where it was found: parabolas are right near whole "
+        doc="go on by least squares, shown anew where it was found: parabolas are right near whole "
         "shifts alone",
     )
     template = Count(WINDOW, minimum=8, doc="rows and columns of a frame that are sought")
@@ -138,14 +143,29 @@ class _Matching(Component):
             least=float(self.least[m]),
         )
 
-    def _tell(self, port: Any, t: float, y: FloatArray, from_first: FloatArray, told: Mask) -> None:
+    def _settled(self, template: Single, image: Single, m: int) -> FrameMatch:
+        return least_squares_shift(
+            template,
+            image,
+            noise=float(self.noise[m]),
+            least=float(self.least[m]),
+            light=self.method != "ssd",
+        )
+
+    def _covariance(self) -> FloatArray:
+        """R of matches (n, 2, 2)."""
+        return (self.match_sigma[:, None] ** 2 + self._variance)[:, None] * np.eye(2)
+
+    def _tell(
+        self, port: Any, t: float, y: FloatArray, R: FloatArray, from_first: FloatArray, told: Mask
+    ) -> None:
         n = self.n_members
         port.publish(
             t,
             valid=told,
             y=np.where(told[:, None], y, 0.0),
             from_first=from_first.reshape(n, 4),
-            R=(self.match_sigma[:, None] ** 2 + self._variance)[:, None] * np.eye(2),
+            R=R,
             present=np.ones((n, 2)),
         )
 
@@ -236,43 +256,56 @@ class _FrameMatcher(_Matching):
                     self._reasons[m] = REASONS.index("beyond the edge of the image")
                     continue
                 frame = self.frame.value[m]
-                template = _cut(_turned(frame, from_first[m]) if turned[m] else frame, size)
-                match = self._sought(template, self.field[m, top:bottom, left:right], m)
+                if turned[m]:
+                    frame = _turned(frame, from_first[m])
+                match = self._sought(_cut(frame, size), self.field[m, top:bottom, left:right], m)
                 self._keep(m, match)
                 row, column = match.row, match.column
                 if self.subpixel and self.again and match.reason == 0:
-                    i, j = round(row), round(column)
-                    off = (row - i, column - j)
-                    template = _cut(_turned(frame, from_first[m], off), size)
-                    top, left = top + up + i - _MARGIN, left + side + j - _MARGIN
-                    room = size + 2 * _MARGIN
-                    match = self._sought(
-                        template, self.field[m, top : top + room, left : left + room], m
-                    )
-                    self._keep(m, match)
-                    row, column = row + match.row, column + match.column
+                    row, column = self._again(m, frame, top + up + row, left + side + column)
+                    row, column = row - top - up, column - left - side
                 y[m] = whole[m, 0] - row, whole[m, 1] + column
 
         over(batches(len(rows)), seek)
         moved = -np.einsum("nij,nj->ni", from_first, y)
         told = seen & (self._reasons == 0)
-        self._tell(self.fix, t, moved, from_first, told)
-        self._tell(self.located, t, moved + at, from_first, told & (self.referenced > 0.5))
+        R = self._covariance()
+        self._tell(self.fix, t, moved, R, from_first, told)
+        # the first frame lies in itself without an error, and on the map with that of its reference
+        R = np.where(self.reference.fresh[:, None, None], self.reference.R, R)
+        self._tell(self.located, t, moved + at, R, from_first, told & (self.referenced > 0.5))
         self._say(seen)
 
+    def _again(self, m: int, frame: Single, row: float, column: float) -> tuple[float, float]:
+        """Corner of a template in the first frame [px], from where it was found."""
+        size = min(self.template, WINDOW - 2 * _EDGE)
+        edge = (self.template - size) // 2
+        for _ in range(_LOOKS):
+            i, j = round(row), round(column)
+            template = _cut(shifted(frame, row - i, column - j), size)
+            top, left = i + edge - _MARGIN, j + edge - _MARGIN
+            room = size + 2 * _MARGIN
+            image = self.field[m, top : top + room, left : left + room]
+            match = self._settled(template, image, m)
+            self._keep(m, match)
+            row, column = row + match.row, column + match.column
+            if match.reason or max(abs(match.row), abs(match.column)) < _STILL:
+                break
+        return row, column
 
-def _turned(frame: Single, from_first: FloatArray, off: tuple[float, float] = (0.0, 0.0)) -> Single:
-    """A frame as the first one would show it, about its middle, `off` rows and columns farther."""
+
+def _turned(frame: Single, from_first: FloatArray) -> Single:
+    """A frame as the first one would show it, about its middle."""
     # from (column, row) there to (column, row) here
     A = _SWAP.T @ from_first @ _SWAP
     middle = (frame.shape[0] - 1) / 2
-    shift = middle - A @ (middle + np.array(off[::-1]))
+    shift = middle - A.sum(axis=1) * middle
     return np.asarray(
         cv2.warpAffine(
             frame,
             np.column_stack([A, shift]),
             frame.shape,
-            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REFLECT,
         )
     )
@@ -315,28 +348,38 @@ class _Georeference(_Matching):
 
         def seek(part: slice) -> None:
             for m in rows[part]:
-                y[m] = self._found(m, target[m], int(gate[m]))
-                if self.subpixel and self.again and self._reasons[m] == 0:
-                    y[m] = self._found(m, y[m], _MARGIN)
+                y[m], _ = self._found(m, target[m], int(gate[m]))
+                for _ in range(_LOOKS if self.subpixel and self.again else 0):
+                    if self._reasons[m] != 0:
+                        break
+                    y[m], moved = self._found(m, y[m])
+                    if moved < _STILL:
+                        break
 
         over(batches(len(rows)), seek)
         told = seen & (self._reasons == 0)
-        self._tell(self.fix, t, y, np.broadcast_to(np.eye(2), (self.n_members, 2, 2)), told)
+        same = np.broadcast_to(np.eye(2), (self.n_members, 2, 2))
+        self._tell(self.fix, t, y, self._covariance(), same, told)
         self._say(seen)
 
-    def _found(self, m: int, target: FloatArray, gate: int) -> FloatArray:
-        """Where the target lies in a member's frame, sought about where it is thought to be."""
-        size = self.template + 2 * gate
+    def _found(self, m: int, target: FloatArray, gate: int = 0) -> tuple[FloatArray, float]:
+        """Where the target lies in a member's frame, from where it is thought to be, and how far.
+
+        Sought in a gate, or without one by least squares.
+        """
+        size = self.template + 2 * (gate or _MARGIN)
         transform = frame_to_scene(
             target[None], self.nominal_view[m : m + 1], self.place, self.grid, size
         )
         if not inside(transform, size, self._map.shape)[0]:
             self._reasons[m] = REASONS.index("beyond the edge of the image")
-            return target
+            return target, 0.0
         image = sampled(self._map, transform[0], size)
-        match = self._sought(_cut(self.frame.value[m], self.template), image, m)
+        seek = self._sought if gate else self._settled
+        match = seek(_cut(self.frame.value[m], self.template), image, m)
         self._keep(m, match)
-        return np.asarray(target + np.array([match.row, -match.column]))
+        off = np.array([match.row, -match.column])
+        return np.asarray(target + off), float(np.abs(off).max())
 
 
 class FrameMatcher(_FrameMatcher):

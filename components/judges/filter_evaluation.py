@@ -25,6 +25,9 @@ from terrafix.models.filters.consistency import normalized_square
 from terrafix.models.filters.error_state import ErrorState, Values
 from terrafix.models.filters.measurement import REASONS, Observation
 
+Places = slice | list[int]
+"""Elements of an error: a slice where they lie side by side, which takes no copy."""
+
 
 class FilterEvaluation(Evaluation):
     """Errors (estimate minus truth) of every block, and what became of each fix: base.
@@ -57,6 +60,9 @@ class FilterEvaluation(Evaluation):
     judged: ClassVar[tuple[str, ...]] = ()
     called: ClassVar[dict[str, str]] = {}
     turned: ClassVar[dict[str, tuple[str, ...]]] = {}
+    _names: ClassVar[tuple[str, ...]]
+    _own: ClassVar[Places]
+    _kept: ClassVar[Places]
 
     estimate: Any
     nees = Output(doc="normalized estimation error squared")
@@ -101,6 +107,9 @@ class FilterEvaluation(Evaluation):
             cls.nees_axes = len(cls._judged())
             cls.measurements = tuple(cls.observations)
             cls.white = not any(block.considered for block in state)
+            cls._names = tuple(block.name for block in state)
+            own = [k for b in state for k in _elements(cls.error_state, b.name)]
+            cls._own, cls._kept = _places(own), _places(cls._judged())
         super().__init_subclass__(**options)
 
     @classmethod
@@ -154,10 +163,8 @@ class FilterEvaluation(Evaluation):
         self._evaluate()
 
     def _evaluate(self) -> None:
-        state, estimate = self.error_state.present, self.estimate
-        own = [k for b in state for k in _elements(self.error_state, b.name)]
-        P = estimate.P[:, own][:, :, own]
-        names = [block.name for block in state]
+        state, estimate, names = self.error_state.present, self.estimate, self._names
+        P = _square(estimate.P, self._own)
         truth = [self.port_views[name] for name in names]
         own_values = [getattr(estimate, name) for name in names]
         if state.carried:
@@ -174,8 +181,7 @@ class FilterEvaluation(Evaluation):
             name = self.called.get(block, block)
             self.port_views[f"{name}_error"][...] = error[:, place]
             self.port_views[f"{name}_sigma"][...] = sigma[:, place]
-        kept = self._judged()
-        self.nees = normalized_square(error[:, kept], P[:, kept][:, :, kept])
+        self.nees = normalized_square(error[:, self._kept], _square(P, self._kept))
         self.covariance = P
         self._judge_fixes()
 
@@ -186,35 +192,47 @@ class FilterEvaluation(Evaluation):
         return [k for b in state if b.name in names for k in _elements(state, b.name)]
 
     def _judge_fixes(self) -> None:
+        told = {prefix: self.port_views[f"{prefix}innovation"] for prefix in self._measured()}
+        if not any(message.fresh.any() for message in told.values()):
+            self._say_of_none()
+            return
         n = self.n_members
         nis, dof, good, come = (np.zeros(n) for _ in range(4))
         reason = np.full(n, np.nan)
         at = 0
         for prefix, seen in self._measured().items():
-            told = self.port_views[f"{prefix}innovation"]
+            of = told[prefix]
             # a fix that was refused says why in `reason`, and nothing of the filter's consistency
-            used = told.fresh & (told.accepted > 0.5)
-            measured = used[:, None] & ((told.residual != 0.0) | (told.sigma != 1.0))
+            used = of.fresh & (of.accepted > 0.5)
+            measured = used[:, None] & ((of.residual != 0.0) | (of.sigma != 1.0))
             self.port_views["normalized_innovation"][:, at : at + seen.size] = np.where(
-                measured, told.residual / np.where(measured, told.sigma, 1.0), np.nan
+                measured, of.residual / np.where(measured, of.sigma, 1.0), np.nan
             )
             at += seen.size
-            nis += np.where(used, told.nis, 0.0)
-            dof += np.where(used, told.dof, 0.0)
-            good, come = good + used, come + told.fresh
-            reason = np.where(told.fresh, told.reason, reason)
+            nis += np.where(used, of.nis, 0.0)
+            dof += np.where(used, of.dof, 0.0)
+            good, come = good + used, come + of.fresh
+            reason = np.where(of.fresh, of.reason, reason)
             if prefix:
                 for name, values, given in (
-                    ("nis", told.nis, used),
-                    ("nis_dof", told.dof, used),
-                    ("accepted", told.accepted, told.fresh),
-                    ("reason", told.reason, told.fresh),
+                    ("nis", of.nis, used),
+                    ("nis_dof", of.dof, used),
+                    ("accepted", of.accepted, of.fresh),
+                    ("reason", of.reason, of.fresh),
                 ):
                     self.port_views[f"{prefix}{name}"][...] = np.where(given, values, np.nan)
         self.nis = np.where(good > 0, nis, np.nan)
         self.nis_dof = np.where(good > 0, dof, np.nan)
         self.accepted = np.where(come > 0, good / np.maximum(come, 1), np.nan)
         self.reason = reason
+
+    def _say_of_none(self) -> None:
+        """What there is to say where no fix came."""
+        for prefix in ("", *(p for p in self._measured() if p)):
+            for name in ("nis", "nis_dof", "accepted", "reason"):
+                self.port_views[f"{prefix}{name}"][...] = np.nan
+        if self._measured():
+            self.port_views["normalized_innovation"][...] = np.nan
 
     def error_model(self) -> Model:
         """Errors of all quantities as a function of what the ports bring, for linearization."""
@@ -294,6 +312,17 @@ def _of_fixes(cls: type[FilterEvaluation]) -> dict[str, Any]:
             doc="of this instant's accepted fixes, over its sigma; NaN where not measured",
         )
     return ports
+
+
+def _places(elements: list[int]) -> Places:
+    """A slice of elements that lie side by side, or the elements."""
+    begin, end = elements[0], elements[-1] + 1
+    return slice(begin, end) if elements == list(range(begin, end)) else elements
+
+
+def _square(P: FloatArray, places: Places) -> FloatArray:
+    """Rows and columns of covariances."""
+    return P[:, places][:, :, places]
 
 
 def _elements(state: ErrorState, name: str) -> range:

@@ -47,20 +47,21 @@ def normalized_square(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
     n = e.shape[-1]
     if P.shape != (*e.shape, n):
         raise ValueError(f"errors of shape {e.shape} do not fit covariances of shape {P.shape}")
-    diagonal = np.diagonal(P, axis1=-2, axis2=-1)
-    finite = np.isfinite(e).all(axis=-1) & np.isfinite(P).all(axis=(-2, -1))
-    valid = np.asarray(finite & (diagonal > 0).all(axis=-1))
-    safe_P = np.where(valid[..., None, None], P, np.eye(n))
-    safe_e = np.where(valid[..., None], e, 0.0)
-    # scale to unit diagonal: the elements have different units
-    sigma = np.sqrt(np.diagonal(safe_P, axis1=-2, axis2=-1))
+    leading = e.shape[:-1]
     # axes first: the members of an element side by side
-    P = np.ascontiguousarray(
-        np.moveaxis(safe_P / (sigma[..., :, None] * sigma[..., None, :]), (-2, -1), (0, 1))
+    e, P = e.reshape(-1, n).T, P.reshape(-1, n, n).transpose(1, 2, 0)
+    diagonal = P.diagonal().T
+    valid = (
+        np.isfinite(e).all(axis=0) & np.isfinite(P).all(axis=(0, 1)) & (diagonal > 0).all(axis=0)
     )
-    e = np.ascontiguousarray(np.moveaxis(safe_e / sigma, -1, 0))
-    L = np.zeros_like(P)
-    whitened = np.zeros_like(e)
+    if not valid.all():
+        e, P = np.where(valid, e, 0.0), np.where(valid, P, np.eye(n)[..., None])
+        diagonal = P.diagonal().T
+    # scale to unit diagonal: the elements have different units
+    sigma = np.sqrt(diagonal)
+    e, P = e / sigma, P / (sigma[:, None] * sigma)
+    L = np.zeros(P.shape)
+    whitened = np.zeros(e.shape)
     total = np.zeros(e.shape[1:])
     for j in range(n):
         below = P[j:, j].copy()  # of the pivot and all rows under it
@@ -75,7 +76,7 @@ def normalized_square(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
         L[j + 1 :, j] = below[1:] / root
         whitened[j] = remaining / root
         total += whitened[j] * whitened[j]
-    return np.where(valid, total, np.nan)
+    return np.where(valid, total, np.nan).reshape(leading)
 
 
 def gate_thresholds(probability: float, max_dof: int = 4) -> FloatArray:

@@ -46,6 +46,7 @@ from functools import cached_property
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.batch import over_members
@@ -404,6 +405,8 @@ class ErrorState:
     @cached_property
     def difference_of_arrays(self) -> Callable[..., FloatArray]:
         """`flat_difference` of arrays (..., size): errors (..., n); with an age, if it has one."""
+        if not self.is_curved:
+            return self._subtracted
         shapes = [(block.value_size,) for block in self.blocks]
         ages = [(1,)] if self.carried else []
         found = over_members(self.flat_difference, *shapes, *shapes, *ages)
@@ -413,6 +416,12 @@ class ErrorState:
             return errors if self.size > 1 else errors[..., None]
 
         return difference
+
+    def _subtracted(self, *values: FloatArray) -> FloatArray:
+        """`difference_of_arrays` where all blocks add."""
+        n = len(self.blocks)
+        one, other = (np.concatenate(part, axis=-1) for part in (values[:n], values[n:]))
+        return np.asarray(one - other)
 
     @property
     def is_curved(self) -> bool:

@@ -254,10 +254,11 @@ def known_pointing_model(state: ErrorState, geometry: str, first_frame: str = "u
     -------
     Model
         Inputs ``r_nominal``, ``v_nominal``, ``aim``, (3,) each; parameters ``position_sigma`` [m],
-        ``velocity_sigma`` [m/s], (3,) each, ``attitude_sigma`` [rad], those of the geometry, and
-        ``georeference_sigma`` [px] where the first frame is georeferenced. Outputs ``start.*`` of
-        all blocks, and ``start.P`` of rank 8, or 10 with a georeference: the first frame matches
-        itself, without an error.
+        ``velocity_sigma`` [m/s], (3,) each, ``attitude_sigma`` [rad], those of the geometry; of
+        `TRACKING` ``mismatch_sigma`` [px], zero where frames are matched to the first one, which
+        matches itself without an error; and ``georeference_sigma`` [px] where that is
+        georeferenced. Outputs ``start.*`` of all blocks, and ``start.P`` of rank 8, or more with
+        these two.
 
     Raises
     ------
@@ -286,6 +287,9 @@ def known_pointing_model(state: ErrorState, geometry: str, first_frame: str = "u
     bias, own = -slope, ca.SX.zeros(state.size)
     if "bias" in state.places:
         values |= {"bias": -values["target"], "mismatch": ca.SX.zeros(2)}
+        p["mismatch_sigma"] = ca.SX.sym("mismatch_sigma")
+        place = state.places["mismatch"]
+        own[place.start : place.stop] = p["mismatch_sigma"] ** 2
     if first_frame == "georeferenced":
         place = state.places["bias"]
         p["georeference_sigma"] = ca.SX.sym("georeference_sigma")

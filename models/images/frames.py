@@ -15,8 +15,18 @@ A template T of a frame is sought in a larger image S within a gate of shifts s,
 
 the first of which is thrown by a change of light. Between whole pixels the peak is that of a
 parabola through it and its neighbors, along rows and along columns: its error depends on the part
-of a pixel by which the images are shifted, and lasts as long as that does. Where the images differ
-by far in a part of the template (a cloud in one of them), it is sought again without that part.
+of a pixel by which the images are shifted, and lasts as long as that does. From there least squares
+go on [3]_: with g the slopes of S, and S, or T, shown anew where they were found,
+
+.. math::
+    s = \Big(\sum_p g g^T\Big)^{-1} \sum_p g\, (T(p) - S(p)),
+
+which is zero where they are alike, wherever that is, and whose covariance is
+:math:`\sigma^2 (\sum g g^T)^{-1}` by the noise of T.
+
+Where the images differ by far in a part of the template (a cloud in one of them), it is sought
+again without that part. If two clouds hide so much that the peak is theirs, it is sought where a
+quantile of differences is least, which does not mind what the others are [4]_.
 
 Images have rows downward, which is south, and columns to the east.
 
@@ -26,6 +36,10 @@ References
        eq. (2.70) and sections 3.4 to 3.6.
 .. [2] C. D. Kuglin, D. C. Hines, "The phase correlation image alignment method", Proc. IEEE
        Conference on Cybernetics and Society, 1975.
+.. [3] B. D. Lucas, T. Kanade, "An iterative image registration technique with an application to
+       stereo vision", Proc. IJCAI, 1981.
+.. [4] P. J. Rousseeuw, "Least median of squares regression", J. Am. Stat. Assoc. 79, 1984; here
+       of a quantile.
 """
 
 from __future__ import annotations
@@ -47,16 +61,28 @@ REASONS = (
     "the peak lies at the edge of the gate",
     "the images are not alike",
     "beyond the edge of the image",
+    "its parts do not agree",
+    "too much is hidden",
 )
 """What became of a match."""
 
 LEAST_TEXTURE = 2.0
 """Standard deviation of a template, at least, in those of its noise: below, nothing is matched."""
 
-_DOUBTFUL = 0.9
-"""Correlation below which a match is looked through for what hides a part of the ground."""
-_OUTLIER, _LEAST_SEEN, _ALL_SEEN = 4.0, 0.4, 0.98
+_DOUBTFUL, _CLEAR = 0.9, 0.97
+"""Correlations below which a match is looked through for what hides a part of the ground: of a
+search, and of least squares, which a strip of a cloud throws by a tenth of a pixel."""
+_OUTLIER, _LEAST_SEEN, _ALL_SEEN = 4.0, 0.3, 0.98
 """Differences beyond, in robust sigmas, are of what hides it; parts of a template that is seen."""
+_SURE, _SURE_SIGMA = 0.35, 0.4538
+"""So many pixels are seen at least; such a part of a normal distribution lies within, in sigmas."""
+_COARSE = 2
+"""Pixels by which a search among hidden ones goes."""
+_DISAGREE = 40.0
+"""What quarters of a template may gain, in squares of what is left: chi-square of 6, whose mean is
+6, and room for what is not white."""
+_TAPS = 4
+"""Pixels to either side that tell one between them."""
 _SMOOTH = 1e-6
 _CLOUD = 250.0
 """Code of a cloud."""
@@ -163,6 +189,25 @@ def sampled(scene: Single, transform: FloatArray, size: int) -> Single:
     )
 
 
+def shifted(image: Single, row: float, column: float) -> Single:
+    """An image moved by parts of a pixel, down and to the right.
+
+    By a sinc in a window of four pixels to either side: what cubic polynomials take off the finest
+    detail makes a match off by 0.02 px.
+    """
+    k = np.arange(1 - _TAPS, 1 + _TAPS)
+    kernels = []
+    for by in (row, column):
+        whole = int(np.floor(-by))
+        x = k - (-by - whole)
+        taps = np.sinc(x) * np.sinc(x / _TAPS)
+        kernel = np.zeros(2 * (_TAPS + abs(whole)) + 1, np.float32)
+        kernel[k + whole + _TAPS + abs(whole)] = taps / taps.sum()
+        kernels.append(kernel)
+    moved = cv2.sepFilter2D(image, -1, kernels[1], kernels[0], borderType=cv2.BORDER_REFLECT)
+    return np.asarray(moved, np.float32)
+
+
 def hidden_square(frame: Single, side: int, rng: np.random.Generator) -> None:
     """Hide a part of a frame behind a bright square of a side [px] somewhere in it, in place."""
     row, column = (int(rng.integers(0, n - side + 1)) for n in frame.shape)
@@ -195,7 +240,8 @@ class FrameMatch:
     reason : int
         Index into `REASONS`; 0 where it was accepted.
     sigma_row, sigma_column : float
-        What noise of both images makes of the shift in this texture [px]; 0 for phase correlation.
+        What noise makes of the shift in this texture [px]: that of both images, or by least squares
+        that of the template; 0 for phase correlation.
     """
 
     row: float
@@ -255,11 +301,7 @@ def match_frame(
     found = image[i : i + rows, j : j + columns]
     alike = _correlation(template, found)
     if alike < _DOUBTFUL:
-        both = _seen_in_both(template, found)
-        if both is not None:
-            surface = _masked_surface(template, image, method, both)
-            i, j = divmod(int(surface.argmax()), surface.shape[1])
-            alike = _correlation(template[both], image[i : i + rows, j : j + columns][both])
+        surface, (i, j), alike = _hidden_in_part(template, image, method, surface, (i, j), alike)
     if i in (0, 2 * reach[0]) or j in (0, 2 * reach[1]):
         return FrameMatch(
             np.nan, np.nan, np.nan, REASONS.index("the peak lies at the edge of the gate")
@@ -294,16 +336,133 @@ def _noise_sigma(score: Single, at: int, noise: float, unit: float, n_pixels: in
     return noise * float(np.sqrt(2.0 * (max(fall, 0.0) + n_pixels * noise * noise))) / bend
 
 
-def _seen_in_both(template: Single, found: Single) -> NDArray[np.bool_] | None:
-    """Pixels at which neither image shows what hides the ground; None where that is not a part.
+def least_squares_shift(
+    template: Single, image: Single, *, noise: float = 0.0, least: float = 0.5, light: bool = False
+) -> FrameMatch:
+    """Shift of a template in an image that is larger by two pixels on all sides, if it is small.
 
-    They differ there by more than `_OUTLIER` robust standard deviations of all differences.
+    Slopes are differences of fourth order: those of second order are too small in fine texture, and
+    tell too large a sigma.
+
+    Parameters
+    ----------
+    template : ndarray of float32, shape (h, w)
+    image : ndarray of float32, shape (h + 4, w + 4)
+    noise : float
+        Standard deviation of the template's noise.
+    least : float
+        Correlation that an accepted match has.
+    light : bool
+        Whether mean and contrast may differ.
+    """
+    middle, across, along = image[2:-2, 2:-2], image[:, 2:-2], image[2:-2]
+    down = (8 * (across[3:-1] - across[1:-3]) - (across[4:] - across[:-4])) / 12
+    right = (8 * (along[:, 3:-1] - along[:, 1:-3]) - (along[:, 4:] - along[:, :-4])) / 12
+    alike, seen = _correlation(template, middle), None
+    if alike < _CLEAR:
+        seen = _seen_in_both(template, middle)
+        if seen is not None and seen.mean() < _LEAST_SEEN:
+            return FrameMatch(np.nan, np.nan, alike, REASONS.index("too much is hidden"))
+    T, S, u, v = (x.ravel() if seen is None else x[seen] for x in (template, middle, down, right))
+    if seen is not None:
+        alike = _correlation(T, S)
+        noise *= float(np.sqrt(2.0))  # pixels are others each time, and the image's noise is, too
+    if not alike >= least:
+        return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
+    if light:
+        T = (T - T.mean()) * (S.std() / T.std()) + S.mean()
+        noise = noise * float(S.std() / template.std())
+    off = T - S
+    a, b, c = float(u @ u), float(u @ v), float(v @ v)
+    det = a * c - b * b
+    if not det > _SMOOTH * a * c:
+        return FrameMatch(np.nan, np.nan, alike, REASONS.index("no texture"))
+    down_off, right_off = float(u @ off), float(v @ off)
+    row, column = (c * down_off - b * right_off) / det, (a * right_off - b * down_off) / det
+    if max(abs(row), abs(column)) > 1.0:
+        return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
+    if seen is not None and not _parts_agree(template, seen, (T, S, u, v), (row, column)):
+        return FrameMatch(np.nan, np.nan, alike, REASONS.index("its parts do not agree"))
+    sigmas = (noise * float(np.sqrt(x / det)) for x in (c, a))
+    return FrameMatch(row, column, alike, 0, *sigmas)
+
+
+def _parts_agree(
+    template: Single,
+    seen: NDArray[np.bool_],
+    pixels: tuple[Single, ...],
+    shift: tuple[float, float],
+) -> bool:
+    """Whether quarters of a template, shifted each by itself, leave as much as all together.
+
+    Two clouds that lie alike on two images hold them together where the ground does not.
+    """
+    T, S, u, v = pixels
+    left = T - S - shift[0] * u - shift[1] * v
+    rows, columns = np.nonzero(seen)
+    quarter = 2 * (rows >= template.shape[0] // 2) + (columns >= template.shape[1] // 2)
+    gain = 0.0
+    for k in range(4):
+        here = quarter == k
+        g, off = np.stack([u[here], v[here]]), left[here]
+        A, b = g @ g.T, g @ off
+        if float(np.linalg.det(A)) > _SMOOTH * float(A[0, 0] * A[1, 1]):
+            gain += float(b @ np.linalg.solve(A, b))
+    return gain < _DISAGREE * float(np.mean(left * left))
+
+
+def _hidden_in_part(
+    template: Single,
+    image: Single,
+    method: str,
+    surface: Single,
+    at: tuple[int, int],
+    alike: float,
+) -> tuple[Single, tuple[int, int], float]:
+    """Score, peak and correlation of a template without what hides a part of it, if that is so."""
+    rows, columns = template.shape
+    best = surface, at, alike
+    for search in (lambda: at, lambda: _of_sure_pixels(template, image)):
+        i, j = search()
+        both = _seen_in_both(template, image[i : i + rows, j : j + columns])
+        if both is None or both.mean() < _LEAST_SEEN:
+            continue
+        surface = _masked_surface(template, image, method, both)
+        i, j = divmod(int(surface.argmax()), surface.shape[1])
+        alike = _correlation(template[both], image[i : i + rows, j : j + columns][both])
+        if alike > best[2]:
+            best = surface, (i, j), alike
+        if alike >= _DOUBTFUL:
+            break
+    return best
+
+
+def _of_sure_pixels(template: Single, image: Single) -> tuple[int, int]:
+    """Where the pixels that are most alike differ least, by a quantile of the differences."""
+    part = template[::_COARSE, ::_COARSE]
+    windows = np.lib.stride_tricks.sliding_window_view(image, template.shape)
+    off = np.abs(windows[..., ::_COARSE, ::_COARSE] - part).reshape(*windows.shape[:2], -1)
+    k = int(_SURE * part.size)
+    score = np.partition(off, k, axis=-1)[..., k]
+    i, j = divmod(int(score.argmin()), score.shape[1])
+    return i, j
+
+
+def _seen_in_both(template: Single, found: Single) -> NDArray[np.bool_] | None:
+    """Pixels at which neither image shows what hides the ground; None where that is all.
+
+    They differ there by more than `_OUTLIER` standard deviations from the others, which are told by
+    the shortest interval that has `_SURE` of all differences.
     """
     off = template - found
-    off -= np.median(off)
-    both: NDArray[np.bool_] = np.abs(off) <= _OUTLIER * 1.4826 * np.median(np.abs(off))
+    line = np.sort(off, axis=None)
+    k = int(_SURE * line.size)
+    widths = line[k:] - line[: line.size - k]
+    at = int(widths.argmin())
+    middle, half = (line[at] + line[at + k]) / 2, widths[at] / 2
+    both: NDArray[np.bool_] = np.abs(off - middle) <= _OUTLIER / _SURE_SIGMA * half
     whole = cv2.erode(both.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return whole if _LEAST_SEEN <= whole.mean() < _ALL_SEEN else None
+    return whole if whole.mean() < _ALL_SEEN else None
 
 
 def _masked_surface(

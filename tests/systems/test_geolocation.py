@@ -21,6 +21,15 @@ needs_data = pytest.mark.skipif(
 )
 SIGMA0 = {"LEO": 5.47, "MOL": 1.947}  # of the target per axis at t = 0 [px]
 
+SIZES = [
+    ("known_located.georeference_sigma", "0.0145 px"),
+    ("matcher.match_sigma", "0.013 px"),
+    ("corrected_predict.mismatch_sigma", "0.005 px"),
+    ("corrected_predict.mismatch_time", "2 s"),
+]
+"""Of the errors of matches in the drawn scene, which is rougher than the Landsat image; measured
+with 40 members of seed 77: 0.0147 and 0.0136 px that last, 0.015 px that does not."""
+
 
 def drawn(file="geolocation", **places):
     """A system with a drawn scene in the place of the Landsat image, which may not be there."""
@@ -144,7 +153,7 @@ def test_twenty_minutes_of_the_honest_filter(orbit):
 def test_the_filter_that_is_told_what_is_so_is_consistent(corrected):
     """NEES (2) and NIS (2) of the corrected profile in [1.6, 2.4], on both orbits."""
     for orbit, spacing in (("LEO", "50 m"), ("MOL", "500 m")):
-        system = tf.read_system(corrected, [("orbit", orbit), ("scene.spacing", spacing)])
+        system = tf.read_system(corrected, [("orbit", orbit), ("scene.spacing", spacing), *SIZES])
         data = tf.simulate(system, members=24, duration="120").dataset
         assert 1.6 < np.nanmean(data["image_corrected.nees"].values) < 2.4
         assert 1.6 < np.nanmean(data["image_corrected.nis"].values) < 2.4
@@ -159,7 +168,7 @@ def test_a_gyro_and_a_star_tracker_in_the_place_of_attitude_that_wanders(tmp_pat
     """
     file = tmp_path / "geolocation_inertial.toml"
     file.write_text(drawn("geolocation_inertial"))
-    data = tf.simulate(tf.read_system(file), members=24, duration="120").dataset
+    data = tf.simulate(tf.read_system(file, SIZES), members=24, duration="120").dataset
     for name in ("non_updated", "image_corrected"):
         assert 1.0 < np.nanmean(data[f"{name}.nees"].values) < 3.0
     sigma = data["non_updated.target_sigma"].values[10]
