@@ -33,12 +33,16 @@ class EnsembleCorrect(FilterCorrect):
 
     _stages: tuple[Model, list[Stage]] | None = None
 
+    def chosen_observation(self) -> EnsembleObservation:
+        """What is observed for the present choices: that of the class, unless a subclass has."""
+        return self.observation
+
     def build_model(self) -> Model:
         """Build the model for the chosen update and weights, whose predictions are inputs."""
         self._stages = staged_model(
             self.model_name,
             self.error_state,
-            self.observation,
+            self.chosen_observation(),
             self.update,
             weights=self.weights,
             chained=True,
@@ -114,7 +118,7 @@ class EnsembleCorrect(FilterCorrect):
 
     def _given(self, who: NDArray[np.int64], n_points: int) -> dict[str, Any]:
         """What the observation reads besides, a row for every point."""
-        seen = self.observation
+        seen = self.chosen_observation()
         given = {n: self.port_views[n][who] for n in seen.inputs}
         given |= {n: self.parameter_values[n][who] for n in seen.parameters}
         given |= {b.name: getattr(self.fix, b.name)[who] for b in seen.fields}
@@ -125,7 +129,8 @@ class EnsembleCorrect(FilterCorrect):
     def _answer(
         self, stage: Stage, who: NDArray[np.int64], values: dict[str, Any], given: dict[str, Any]
     ) -> None:
-        seen, n, m = self.observation, self.error_state.size, self.observation.size
+        seen = self.chosen_observation()
+        n, m = self.error_state.size, seen.size
         k, p = len(who), len(stage.numbers)
         kinds: list[tuple[str, Callable[..., Any], tuple[int, ...]]] = [("y", seen.predict, (m,))]
         if stage.derived:

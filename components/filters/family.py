@@ -280,12 +280,16 @@ class FilterPredict(SymbolicComponent):
         if self.told:
             check_start(self)
 
+    def chosen_process(self) -> Process:
+        """The process for the present choices: that of the class, unless a subclass has some."""
+        return self.process
+
     def build_model(self) -> Model:
         """Build the model of the process."""
         return predict_model(
             f"{type(self).__name__.lower()}",
             self.error_state,
-            self.process,
+            self.chosen_process(),
             told=self.told,
             sigmas=starting_sigmas(self.error_state, self.told, self.sigmas),
             smoothed=self.smoothed,
@@ -332,12 +336,16 @@ class FilterCorrect(SymbolicComponent):
         robust = "" if self.weights == "none" else f"_{self.weights}"
         return f"{type(self).__name__.lower()}_{self.update}{robust}"
 
+    def chosen_observation(self) -> Observation:
+        """What is observed for the present choices: that of the class, unless a subclass has."""
+        return self.observation
+
     def build_model(self) -> Model:
         """Build the model for the chosen update and weights."""
         return correct_model(
             self.model_name,
             self.error_state,
-            self.observation,
+            self.chosen_observation(),
             self.update,
             weights=self.weights,
             chained=True,

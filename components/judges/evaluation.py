@@ -1,13 +1,25 @@
-"""Navigation evaluation: errors against truth, NEES and NIS of the spacecraft filter."""
+"""Navigation evaluation: errors against truth, NEES and NIS of each system's filter."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from terrafix.components.judges.filter_evaluation import FilterEvaluation
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.parameters import Choice
 from terrafix.cosim.declare.ports import Input
+from terrafix.models.filters.contours import clearance_observation
+from terrafix.models.filters.error_state import Values
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
+from terrafix.models.filters.navigator import (
+    DRIFTING,
+    NAVIGATOR,
+    altimeter_observation,
+    shift_observation,
+)
 from terrafix.models.filters.shore import shore_observation
 from terrafix.models.filters.spacecraft import STATE, sar_observation
+from terrafix.models.motion.strapdown import EARTHS, level_axes
 
 
 class NavigationEvaluation(FilterEvaluation):
@@ -40,3 +52,56 @@ class ConsideredOrbitEvaluation(OrbitEvaluation):
     attitude = Input((3,), unit="rad", frame="c", optional=True, doc="truth: misalignment")
     scale = Input((1,), optional=True, doc="truth: what the catalog's outlines are too small by")
     outline = Input((6,), unit="m", optional=True, doc="truth: of errors of vertices; not known")
+
+
+_INERTIAL = {
+    "r_e": "position",
+    "v_e": "velocity",
+    "q_be": "attitude",
+    "accel_bias_b": "accel_bias",
+    "gyro_bias_b": "gyro_bias",
+}
+
+
+class InertialEvaluation(FilterEvaluation):
+    """Errors of an aircraft's navigator in north, east and down, NEES, and the altimeter's fixes."""
+
+    default_rate = Rate("1")
+    error_state = DRIFTING
+    observations = {"altimeter": altimeter_observation("wgs84")}  # noqa: RUF012
+    called = _INERTIAL
+    turned = dict.fromkeys(("r_e", "v_e", "q_be"), ("n", "north", "east", "down"))
+
+    earth = Choice(EARTHS, "wgs84", doc="that of the motion")
+
+    def rotation(self, truth: Values) -> Any:
+        """Transformation (3, 3) from e to north, east, down at the true position."""
+        return level_axes(truth["r_e"], self.setting("earth"))
+
+
+class ContourEvaluation(InertialEvaluation):
+    """The same where contours of the terrain are matched, too."""
+
+    observations = {  # noqa: RUF012
+        **InertialEvaluation.observations,
+        "contour": clearance_observation(DRIFTING, "wgs84"),
+    }
+
+
+class RadarInertialEvaluation(InertialEvaluation):
+    """The same of a navigator with a radar."""
+
+    error_state = NAVIGATOR
+    observations = {  # noqa: RUF012
+        **InertialEvaluation.observations,
+        "radar": shift_observation("wgs84"),
+    }
+
+
+class RadarContourEvaluation(RadarInertialEvaluation):
+    """The same of a navigator with a radar that matches contours of the terrain, too."""
+
+    observations = {  # noqa: RUF012
+        **RadarInertialEvaluation.observations,
+        "contour": clearance_observation(NAVIGATOR, "wgs84"),
+    }

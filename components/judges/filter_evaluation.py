@@ -16,11 +16,13 @@ from terrafix.components.filters.family import (
     value_field,
 )
 from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.declare.component import Environment
 from terrafix.cosim.declare.evaluation import Evaluation, History, Quantity, consistency
 from terrafix.cosim.declare.ports import BundleInput, Input, MessageInput, Output
+from terrafix.models.core.batch import over_members
 from terrafix.models.core.model import Model
 from terrafix.models.filters.consistency import normalized_square
-from terrafix.models.filters.error_state import ErrorState
+from terrafix.models.filters.error_state import ErrorState, Values
 from terrafix.models.filters.measurement import REASONS, Observation
 
 
@@ -44,6 +46,9 @@ class FilterEvaluation(Evaluation):
         Blocks that NEES is taken over; all, if empty.
     called : dict of str to str
         Blocks whose errors go by another name.
+    turned : dict of str to tuple of str
+        Blocks of three elements whose errors are told in other axes, of which `rotation` is the
+        transformation: frame and labels.
     """
 
     error_state: ClassVar[ErrorState]
@@ -51,6 +56,7 @@ class FilterEvaluation(Evaluation):
     observations: ClassVar[dict[str, Observation]] = {}
     judged: ClassVar[tuple[str, ...]] = ()
     called: ClassVar[dict[str, str]] = {}
+    turned: ClassVar[dict[str, tuple[str, ...]]] = {}
 
     estimate: Any
     nees = Output(doc="normalized estimation error squared")
@@ -60,7 +66,7 @@ class FilterEvaluation(Evaluation):
     reason = Output(doc="index into terrafix.models.filters.measurement.REASONS, of the last")
 
     def __init_subclass__(cls, **options: Any) -> None:
-        if says(cls, "error_state", "observation", "observations", "judged", "called"):
+        if says(cls, "error_state", "observation", "observations", "judged", "called", "turned"):
             state, ports = cls.error_state.present, dict[str, Any]()
             _check(cls)
             for block in state:
@@ -68,10 +74,13 @@ class FilterEvaluation(Evaluation):
                 ports[block.name] = Input(
                     truth.fixed_shape, unit=truth.unit, frame=truth.frame, doc="truth"
                 )
-                labels = block.axes if block.size > 1 else ()
+                frame, labels = block.frame, block.axes if block.size > 1 else ()
+                if block.name in cls.turned:
+                    frame, *axes = cls.turned[block.name]
+                    labels = tuple(axes)
                 for kind, doc in (("error", "estimate minus truth"), ("sigma", "predicted")):
                     ports[f"{name}_{kind}"] = Output(
-                        (block.size,), unit=block.unit, frame=block.frame, labels=labels, doc=doc
+                        (block.size,), unit=block.unit, frame=frame, labels=labels, doc=doc
                     )
             fields = estimate_fields(cls.error_state)
             ports["estimate"] = BundleInput(fields, doc="to be evaluated")
@@ -82,7 +91,12 @@ class FilterEvaluation(Evaluation):
             ports |= _of_fixes(cls)
             declare(cls, **ports)
             cls.quantities = tuple(
-                Quantity(cls.called.get(b.name, b.name), b.unit, b.axes) for b in state
+                Quantity(
+                    cls.called.get(b.name, b.name),
+                    b.unit,
+                    cls.turned.get(b.name, ("", *b.axes))[1:],
+                )
+                for b in state
             )
             cls.nees_axes = len(cls._judged())
             cls.measurements = tuple(cls.observations)
@@ -95,6 +109,43 @@ class FilterEvaluation(Evaluation):
         if cls.observation is not None:
             return {"": cls.observation}
         return {f"{name}_": seen for name, seen in cls.observations.items()}
+
+    def rotation(self, truth: Values) -> Any:
+        """Transformation (3, 3) from the axes of turned blocks to those they are told in.
+
+        Parameters
+        ----------
+        truth : mapping of str to SX
+            True values by block.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must provide rotation()")
+
+    def _turning(self, truth: Values) -> Any:
+        """Derivative (n, n) of the errors as they are told by those of the error state."""
+        state, C = self.error_state.present, self.rotation(truth)
+        return ca.diagcat(*(C if b.name in self.turned else ca.SX.eye(b.size) for b in state))
+
+    def _turn_arrays(self, truth: list[FloatArray]) -> FloatArray:
+        """`_turning` of all members, (k, n, n)."""
+        if self._turn is None:
+            names = [block.name for block in self.error_state.present]
+            shapes = [(block.value_size,) for block in self.error_state.present]
+            self._turn = over_members(
+                lambda *values: self._turning(dict(zip(names, values, strict=True))), *shapes
+            )
+        found: FloatArray = self._turn(*truth)
+        return found
+
+    _turn: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to another process: without a function that is made there."""
+        return {k: v for k, v in self.__dict__.items() if k != "_turn"}
+
+    def bind(self, environment: Environment) -> None:
+        """Begin with the choices of this run."""
+        super().bind(environment)
+        self._turn = None
 
     def _initialize_impl(self) -> None:
         self._evaluate()
@@ -114,6 +165,9 @@ class FilterEvaluation(Evaluation):
             error = -state.difference_of_arrays(*truth, *own_values, estimate.age)
         else:
             error = state.difference_of_arrays(*own_values, *truth)
+        if self.turned:
+            J = self._turn_arrays(truth)
+            error, P = np.einsum("kij,kj->ki", J, error), J @ P @ J.transpose(0, 2, 1)
         variance = np.diagonal(P, axis1=1, axis2=2)
         sigma = np.sqrt(np.where(variance > 0.0, variance, np.nan))
         for block, place in state.places.items():
@@ -169,6 +223,8 @@ class FilterEvaluation(Evaluation):
         inputs = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
         given = {f"estimate.{n}": ca.SX.sym(f"estimate_{n}", *s) for n, s in shapes.items()}
         error = state.flat_difference(*given.values(), *inputs.values())
+        if self.turned:
+            error = ca.mtimes(self._turning(inputs), error)
         return Model("filter_error", inputs={**inputs, **given}, outputs={"error": error})
 
     def summarize(self, times: FloatArray, history: History) -> dict[str, Any]:

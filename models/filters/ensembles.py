@@ -240,6 +240,7 @@ def staged_model(
         fields=observation.fields,
         angles=observation.angles,
         instant=observation.instant,
+        valid_at=observation.valid_at,
     )
     model = correct_model(name, state, traced, update, **options)
     level: dict[int, int] = {}

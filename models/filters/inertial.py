@@ -47,7 +47,7 @@ TRANSITIONS = ("closed", "derived")
 INERTIAL = (
     vector("r_e", unit="m", frame="e"),
     vector("v_e", unit="m/s", frame="e"),
-    rotation("q_be", side="right", frame="e"),
+    rotation("q_be", side="right", frame="b"),  # as ports have it; its error is in e axes
     vector("accel_bias_b", unit="m/s^2", frame="b"),
     vector("gyro_bias_b", unit="rad/s", frame="b"),
 )

@@ -58,12 +58,15 @@ class Observation:
         Sizes of what else it reads.
     instant : str
         Of the clones that it is a measurement of; empty: of now.
+    valid_at : str
+        Field of the message that holds the time that the fix is of, for sensors that say it there;
+        empty: the message's own time.
 
     Raises
     ------
     ValueError
-        If a mapped field is none of the message's, an angle no element in radians, or something
-        is called ``t``.
+        If a mapped field or the one of the time is none of the message's, an angle no element in
+        radians, or something is called ``t``.
     """
 
     predict: Callable[[Values, Values], Any]
@@ -74,10 +77,16 @@ class Observation:
     inputs: Mapping[str, int] = field(default_factory=dict)
     parameters: Mapping[str, int] = field(default_factory=dict)
     instant: str = ""
+    valid_at: str = ""
     of_ensembles: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         names = [block.name for block in self.fields]
+        if self.valid_at and self.valid_at not in names:
+            raise ValueError(
+                f"an observation is valid at '{self.valid_at}', which is no field of its message; "
+                f"the fields are {', '.join(names) or 'none'}"
+            )
         if TIME in (*names, *self.inputs, *self.parameters):
             raise ValueError(
                 f"an observation reads '{TIME}', which is the time that a fix is of: choose "

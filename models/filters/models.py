@@ -262,7 +262,7 @@ def correct_model(
         **{f"prior.{key}": symbol for key, symbol in prior.items()},
         **{f"fix.{key}": symbol for key, symbol in fix.items()},
         "fix.fresh": fresh,
-        "fix.t": fix_t,
+        **({} if observation.valid_at else {"fix.t": fix_t}),
     }
     counted, beta, n_updates = {}, ca.SX(0), ca.SX.sym("n_updates")
     if underweighting:
@@ -272,7 +272,8 @@ def correct_model(
         )
     arrived = fresh > 0.5
     fix["present"] = ca.if_else(arrived, fix["present"], 0.0)
-    measurement = observation.about(state, prior, fix, {**inputs, **parameters, TIME: fix_t})
+    of = fix[observation.valid_at] if observation.valid_at else fix_t
+    measurement = observation.about(state, prior, fix, {**inputs, **parameters, TIME: of})
     outcome = corrected(
         state,
         prior,
@@ -280,7 +281,7 @@ def correct_model(
         rule,
         gate=gate,
         beta=beta,
-        lateness=fix_t - (prior[f"t_{observation.instant}"] if observation.instant else time),
+        lateness=of - (prior[f"t_{observation.instant}"] if observation.instant else time),
         recentered=recentered,
     )
     accepted = ca.logic_and(arrived, outcome.accepted)

@@ -77,11 +77,7 @@ class Dem:
         ValueError
             If a place is outside, or next to a void.
         """
-        i, j, u, w = self._cell(latitude, longitude)
-        h = self.height
-        south = h[i, j] * (1 - w) + h[i, j + 1] * w
-        north = h[i + 1, j] * (1 - w) + h[i + 1, j + 1] * w
-        out = np.asarray(south * (1 - u) + north * u)
+        h, out = self.height, self._bilinear(latitude, longitude)
         if not np.isfinite(out).all():
             k = int(np.argmin(np.isfinite(out.ravel())))
             lat, lon = (np.broadcast_to(a, out.shape).ravel()[k] for a in (latitude, longitude))
@@ -90,6 +86,22 @@ class Dem:
                 f"{h.size} points\n  fill its voids by interpolation, or use another"
             )
         return out
+
+    def known_at(self, latitude: ArrayLike, longitude: ArrayLike) -> FloatArray:
+        """Height [m] at latitudes and longitudes [rad], shape (...); NaN where it is not known."""
+        latitude, longitude = np.broadcast_arrays(latitude, longitude)
+        out = np.full(latitude.shape, np.nan)
+        inside = self.covers(latitude, longitude)
+        out[inside] = self._bilinear(latitude[inside], longitude[inside])
+        return out
+
+    def _bilinear(self, latitude: ArrayLike, longitude: ArrayLike) -> FloatArray:
+        """Height [m] between the points of the grid; NaN next to a void."""
+        i, j, u, w = self._cell(latitude, longitude)
+        h = self.height
+        south = h[i, j] * (1 - w) + h[i, j + 1] * w
+        north = h[i + 1, j] * (1 - w) + h[i + 1, j + 1] * w
+        return np.asarray(south * (1 - u) + north * u)
 
     def slopes(self, latitude: ArrayLike, longitude: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Rise to the north and to the east [m/m] at latitudes and longitudes [rad].

@@ -40,6 +40,8 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("shore_matcher", "shore_correct", "orbit_evaluation_shore"),  # in systems/test_leo_lake_shore
     *("last_known_orbit", "orbit_evaluation", "orbit_evaluation_considered"),
     *("orbit_predict", "orbit_predict_considered"),  # in systems/test_leo_lake
+    "radar_altimeter",  # in sensors/test_aircraft_sensors
+    *("clearance_correct", "clearance_correct_radar"),  # in filters/test_clearance
 }
 FOREIGN = {"fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
 SIZES = (1, 7, 100)
@@ -62,7 +64,21 @@ INPUTS = {
     "delta_v_b_true": (np.zeros(3), 1e-3),
     "delta_theta_b": (np.zeros(3), 1e-4),
     "delta_theta_b_true": (np.zeros(3), 1e-4),
-    "P": (np.diag(SIGMA**2), 0.0),
+    "r_e_at_aperture": (R_E, 100.0),
+    "v_e_at_aperture": (V_E, 0.1),
+    "t_aperture": (np.zeros(1), 0.0),
+    "accel_bias_b": (np.zeros(3), 1e-4),
+    "gyro_bias_b": (np.zeros(3), 1e-6),
+    "altimeter_bias": (np.zeros(1), 1.0),
+    "range_bias": (np.zeros(1), 1.0),
+    "cross_range_bias": (np.zeros(1), 1.0),
+    "p_t_e": (R_E * 0.9, 100.0),
+    "speed": (np.array([7.5e3]), 0.0),
+    "f_b": (np.zeros(3), 1e-3),
+    "t_center": (np.zeros(1), 0.0),
+    "F": (1e-6 * np.eye(3), 0.0),
+    "index": (0.0, 0.0),
+    "P": (np.diag(np.append(SIGMA, [1e-2] * 15) ** 2), 0.0),
     "y": (np.array([0.0, 0.0, 9.0e5, 7.5e3]), np.array([1e-3, 1e-3, 100.0, 1.0])),
     "r_f_e": (R_E * 0.9, 100.0),
     "R": (np.diag([0.0, 0.0, 1.0, 0.3]), 0.0),
@@ -90,13 +106,22 @@ SETTINGS = {
         "gyro_bias_sigma0": 1e-6,
         "gyro_bias_walk": 1e-8,
     },
+    **dict.fromkeys(
+        ("inertial_predict", "inertial_predict_radar"),
+        {
+            "velocity_random_walk": 1e-3,
+            "angle_random_walk": 1e-5,
+            "accel_bias_sigma": 1e-3,
+            "gyro_bias_sigma": 1e-5,
+        },
+    ),
     "mekf_correct": {"look": 0.6},
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "mekf_predict_smoothed": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "orbit": {"r0_i": R_E, "v0_i": [-560.1, 3729.6, 6497.9]},
     "synthetic_sar_fix": {"look": 0.6},
 }
-RATES = {"last_known_state": Rate(times=["0"])}
+RATES = dict.fromkeys(("last_known_state", "last_known_flight"), Rate(times=["0"]))
 
 
 class Inputs(Component):
@@ -279,5 +304,7 @@ def _components(file: Path) -> list[str]:
     bases += ("EnsembleCorrect", "Optics")
     abstract = (*bases, "FilterAcquisition", "FilterSensor", "FilterTruth")
     bases += ("LakeCorrect", "MekfPredict", "OrbitEvaluation", "OrbitPredict")
+    bases += ("AltimeterCorrect", "ClearanceCorrect", "InertialPredict")
+    bases += ("InertialEvaluation", "RadarInertialEvaluation")
     derived = [c.name for c in classes if c.bases and ast.unparse(c.bases[0]) in bases]
     return [name for name in derived if name not in abstract]

@@ -1,0 +1,125 @@
+r"""Terrain contour matching: the clearance over the ground against an elevation model.
+
+A radar altimeter measures how far the ground is below,
+
+.. math::
+    z = h(r) - h_g(\varphi, \lambda), \qquad
+    H = [\, -\partial_N h_g \;\; -\partial_E h_g \;\; -1 \,]\; C_{ne} ,
+
+so that every measurement is a point of a profile, and slopes tell where it was flown [1]_. Slopes
+are central differences over one step of the grid to either side. That holds while the error of the
+estimate is small beside hills; `terrafix.models.maps.contours` finds it from further away.
+
+References
+----------
+.. [1] L. D. Hostetler, R. D. Andreas, "Nonlinear Kalman filtering techniques for terrain-aided
+       navigation", IEEE Trans. Automatic Control 28(3), 1983.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.batch import over_members
+from terrafix.models.filters.ensembles import Arrays, EnsembleObservation
+from terrafix.models.filters.error_state import ErrorState
+from terrafix.models.geometry.geodesy import geodetic_from_ecef_array
+from terrafix.models.maps.dem import Dem
+from terrafix.models.motion.strapdown import EARTHS, chart_scales, level_axes, rotation_rate
+
+SHARED = ("height", "grid")
+"""Arrays of an elevation model: heights, and where they lie."""
+ORIGIN = ("latitude0", "longitude0")
+"""Where on the ellipsoid a flat Earth has its origin [rad]."""
+
+_scales = over_members(lambda latitude: tuple(chart_scales(latitude)), ())
+_level_axes = {
+    earth: over_members(lambda r_e, earth=earth: level_axes(r_e, earth), (3,)) for earth in EARTHS
+}
+
+
+def geodetic_of(
+    r_e: FloatArray, earth: str, origin: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Latitude, longitude [rad] and height [m], (k,), of positions (k, 3) on an Earth.
+
+    The origin (k,), (k,) is that of the flat Earth, in the scales of whose place north and east are
+    drawn.
+    """
+    if rotation_rate(earth):
+        latitude, longitude, height = geodetic_from_ecef_array(r_e)
+        return latitude, longitude, height
+    north, east = _scales(origin[0])
+    return origin[0] + r_e[:, 0] / north, origin[1] + r_e[:, 1] / east, -r_e[:, 2]
+
+
+def level_axes_of(r_e: FloatArray, earth: str) -> FloatArray:
+    """Transformations (k, 3, 3) from e to north, east, down at positions (k, 3)."""
+    found: FloatArray = _level_axes[earth](r_e)
+    return np.broadcast_to(found, (len(r_e), 3, 3))
+
+
+def dem_of(told: Mapping[str, Any]) -> Dem:
+    """Elevation model of shared arrays."""
+    south, west, north, east, mirrored = (float(g) for g in told["grid"])
+    return Dem(told["height"], south, west, north, east, mirrored=bool(mirrored))
+
+
+def clearance_observation(state: ErrorState, earth: str) -> EnsembleObservation:
+    """The clearance over the ground of an elevation model; NaN where that is not known.
+
+    Parameters
+    ----------
+    state : ErrorState
+        With a block ``r_e``.
+    earth : {"wgs84", "flat"}
+        Of the flat one the parameters ``latitude0`` and ``longitude0`` [rad] tell the origin.
+    """
+    rotation_rate(earth)
+    place = state.places["r_e"]
+
+    def where(estimate: Arrays, told: Arrays) -> tuple[Dem, FloatArray, FloatArray, FloatArray]:
+        origin = tuple(np.reshape(told[name], -1) for name in ORIGIN)
+        return dem_of(told), *geodetic_of(estimate["r_e"], earth, (origin[0], origin[1]))
+
+    def predict(estimate: Arrays, told: Arrays) -> NDArray[Any]:
+        dem, latitude, longitude, height = where(estimate, told)
+        return np.asarray(height - dem.known_at(latitude, longitude))[:, None]
+
+    def derivative(estimate: Arrays, told: Arrays) -> NDArray[Any]:
+        dem, latitude, longitude, _ = where(estimate, told)
+        north, east = _scales(latitude if rotation_rate(earth) else told[ORIGIN[0]].reshape(-1))
+        by_level = np.stack(
+            [
+                -_rise(dem, latitude, longitude, dem.latitude_step, 0.0) / north,
+                -_rise(dem, latitude, longitude, 0.0, dem.longitude_step) / east,
+                np.full(len(latitude), -1.0),
+            ],
+            axis=1,
+        )
+        H = np.zeros((len(latitude), 1, state.size))
+        axes = level_axes_of(estimate["r_e"], earth)
+        H[:, 0, place] = np.einsum("ki,kij->kj", by_level, axes)
+        return H
+
+    return EnsembleObservation(
+        predict,
+        {"clearance": "m"},
+        derivative=derivative,
+        shared=SHARED,
+        parameters=dict.fromkeys(ORIGIN, 1),
+    )
+
+
+def _rise(
+    dem: Dem, latitude: FloatArray, longitude: FloatArray, d_lat: float, d_lon: float
+) -> FloatArray:
+    """Rise per radian along a step of the grid to both sides."""
+    ahead = dem.known_at(latitude + d_lat, longitude + d_lon)
+    behind = dem.known_at(latitude - d_lat, longitude - d_lon)
+    return np.asarray((ahead - behind) / (2 * (d_lat + d_lon)))
