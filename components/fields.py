@@ -177,3 +177,48 @@ RADII: dict[str, Any] = {"shape": (None,), "unit": "m"}
 
 AREAS: dict[str, Any] = {"shape": (None,), "unit": "m^2"}
 """Area of each lake on the ellipsoid, of the rings that are there: its islands less."""
+
+HEIGHT_FIX = {
+    "y": Field((1,), "m", labels=("height",), doc="measured"),
+    "R": Field((1, 1), "1", doc="covariance of the noise of y, in its units"),
+    "present": Field((1,), "1", labels=("height",), doc="1 where an element was measured, else 0"),
+}
+"""What an altimeter measures."""
+
+CLEARANCE_FIX = {
+    "y": Field((1,), "m", labels=("clearance",), doc="measured"),
+    "R": HEIGHT_FIX["R"],
+    "present": Field(
+        (1,), "1", labels=("clearance",), doc="1 where an element was measured, else 0"
+    ),
+}
+"""What a radar altimeter measures."""
+
+SHIFT = ("range", "cross_range", "map_drift")
+SHIFT_FIX = {
+    "y": Field((3,), ("m", "m", "m/s"), labels=SHIFT, doc="measured"),
+    "p_t_e": Field((3,), "m", "e", labels=XYZ, doc="ground point that it is of"),
+    "speed": Field((1,), "m/s", doc="that the image was formed with"),
+    "f_b": Field((3,), "m/s^2", "b", labels=XYZ, doc="mean specific force, in axes of its end"),
+    "t_center": Field((1,), "s", doc="of the aperture"),
+    "R": Field((3, 3), "1", doc="covariance of the noise of y, in its units"),
+    "F": Field((3, 3), "m/s^2^2", "b", doc="covariance of the error of f_b"),
+    "present": Field((3,), "1", labels=SHIFT, doc="1 where an element was measured, else 0"),
+}
+"""What the image of an aperture measures."""
+
+MOTION = {
+    "r_e": Field((3,), "m", "e", labels=XYZ, doc="position"),
+    "v_e": Field((3,), "m/s", "e", labels=XYZ, doc="velocity relative to the Earth"),
+    "q_be": Field((4,), "1", "b", doc="attitude, e to body"),
+    "accel_bias_b": Field((3,), "m/s^2", "b", labels=XYZ),
+    "gyro_bias_b": Field((3,), "rad/s", "b", labels=XYZ),
+    "altimeter_bias": Field((1,), "m"),
+    "range_bias": Field((1,), "m"),
+    "cross_range_bias": Field((1,), "m"),
+    "r_e_at_aperture": Field((3,), "m", "e", labels=XYZ, doc="at the aperture's center"),
+    "v_e_at_aperture": Field((3,), "m/s", "e", labels=XYZ, doc="at the aperture's center"),
+    "t_aperture": Field((1,), "s", doc="of that center"),
+    "P": Field((24, 24), "1", doc="covariance of the error, in units of its elements"),
+}
+"""What the navigator of an aircraft with a radar knows."""

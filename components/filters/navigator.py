@@ -10,7 +10,7 @@ from terrafix.components.filters.family import FilterCorrect, FilterPredict
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import Input, SharedInput
-from terrafix.models.filters.contours import ORIGIN, clearance_observation
+from terrafix.models.filters.contours import clearance_observation
 from terrafix.models.filters.ensembles import EnsembleObservation
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.navigator import (
@@ -22,6 +22,7 @@ from terrafix.models.filters.navigator import (
     shift_observation,
 )
 from terrafix.models.filters.process import Process
+from terrafix.models.maps.charts import ORIGIN
 from terrafix.models.motion.strapdown import EARTHS
 
 _POLE = np.pi / 2

@@ -64,7 +64,7 @@ _INERTIAL = {
 
 
 class InertialEvaluation(FilterEvaluation):
-    """Errors of an aircraft's navigator in north, east and down, NEES, and the altimeter's fixes."""
+    """Errors of an aircraft's navigator in north, east and down, NEES, the altimeter's fixes."""
 
     default_rate = Rate("1")
     error_state = DRIFTING

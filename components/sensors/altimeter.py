@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.components.fields import GRID, HEIGHT
-from terrafix.components.filters.family import fix_fields
+from terrafix.components.fields import CLEARANCE_FIX, GRID, HEIGHT, HEIGHT_FIX
 from terrafix.components.noisy import NoisyComponent
+from terrafix.components.truth.terrain import dem_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -14,8 +14,7 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import Input, MessageOutput, Output, SharedInput
 from terrafix.models.core.model import Model
-from terrafix.models.filters.contours import ORIGIN, clearance_observation, dem_of, geodetic_of
-from terrafix.models.filters.navigator import DRIFTING, altimeter_observation
+from terrafix.models.maps.charts import ORIGIN, geodetic_of
 from terrafix.models.motion.strapdown import EARTHS
 from terrafix.models.sensors.altimeter import altimeter_model
 
@@ -33,7 +32,7 @@ class Altimeter(NoisyComponent):
     bias_time = Parameter(100.0, unit="s", positive=True, doc="correlation of the bias")
 
     r_e = Input((3,), unit="m", frame="e", doc="true position")
-    fix = MessageOutput(fields=fix_fields(altimeter_observation("wgs84")), doc="measured height")
+    fix = MessageOutput(fields=HEIGHT_FIX, doc="measured height")
     bias = Output((1,), unit="m", doc="true bias")
 
     def build_model(self) -> Model:
@@ -61,7 +60,7 @@ class RadarAltimeter(Component):
     r_e = Input((3,), unit="m", frame="e", doc="true position")
     height = SharedInput(**HEIGHT, doc="heights of the ground")
     grid = SharedInput(**GRID, doc="where they lie")
-    fix = MessageOutput(fields=fix_fields(clearance_observation(DRIFTING, "wgs84")))
+    fix = MessageOutput(fields=CLEARANCE_FIX, doc="measured clearance")
 
     def takes(self, name: str) -> bool:
         """Whether a setting has any effect: an origin has on a flat Earth alone."""
@@ -83,15 +82,14 @@ class RadarAltimeter(Component):
 
     def _clearance(self) -> FloatArray:
         """True clearance (n_members,) [m]; NaN where the ground is not known."""
-        told = {"height": self.height, "grid": self.grid}
         where = geodetic_of(self.r_e, self.setting("earth"), (self.latitude0, self.longitude0))
         self._where = where
-        return np.asarray(where[2] - dem_of(told).known_at(*where[:2]))
+        return np.asarray(where[2] - dem_from(self.height, self.grid).known_at(*where[:2]))
 
     def _check_track(self, clearance: FloatArray, when: str) -> None:
         """Fail members that are where no ground is known, or below it: the run, if all are."""
         active = self.environment.active
-        dem = dem_of({"height": self.height, "grid": self.grid})
+        dem = dem_from(self.height, self.grid)
         latitude, longitude, height = self._where
         for wrong, told in (
             (np.isnan(clearance), f"where no ground is known: it is {dem.described()}"),

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.components.fields import XYZ
-from terrafix.components.filters.family import estimate_fields, fix_fields
+from terrafix.components.fields import MOTION, SHIFT_FIX, XYZ
 from terrafix.components.noisy import NoisyComponent
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
@@ -13,7 +12,6 @@ from terrafix.cosim.declare.ports import BundleInput, Input, MessageInput, Messa
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.memory.fields import Field
 from terrafix.models.core.model import Model
-from terrafix.models.filters.navigator import NAVIGATOR, shift_observation
 from terrafix.models.motion.strapdown import EARTHS
 from terrafix.models.sensors.aperture import LOOKS, ROWS, aperture_model, synthetic_shift_model
 
@@ -77,8 +75,8 @@ class SyntheticShift(NoisyComponent):
     q_be = Input((4,), unit="1", frame="b", doc="true attitude, e to body")
     f_b = Input((3,), unit="m/s^2", frame="b", default=0.0, doc="mean specific force of the IMU")
     center = MessageInput(fields=MARK, doc="now is the center of an aperture")
-    prior = BundleInput(estimate_fields(NAVIGATOR), doc="estimate of now and of the center")
-    fix = MessageOutput(fields=fix_fields(shift_observation("wgs84")), doc="the fix")
+    prior = BundleInput(MOTION, doc="estimate of now and of the center")
+    fix = MessageOutput(fields=SHIFT_FIX, doc="the fix")
     range_bias = Output((1,), unit="m", doc="true bias of range")
     cross_range_bias = Output((1,), unit="m", doc="true bias of cross-range")
 

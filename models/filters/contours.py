@@ -25,43 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray
-from terrafix.models.core.batch import over_members
 from terrafix.models.filters.ensembles import Arrays, EnsembleObservation
 from terrafix.models.filters.error_state import ErrorState
-from terrafix.models.geometry.geodesy import geodetic_from_ecef_array
+from terrafix.models.maps.charts import ORIGIN, geodetic_of, level_axes_of, scales_of
 from terrafix.models.maps.dem import Dem
-from terrafix.models.motion.strapdown import EARTHS, chart_scales, level_axes, rotation_rate
+from terrafix.models.motion.strapdown import rotation_rate
 
 SHARED = ("height", "grid")
 """Arrays of an elevation model: heights, and where they lie."""
-ORIGIN = ("latitude0", "longitude0")
-"""Where on the ellipsoid a flat Earth has its origin [rad]."""
-
-_scales = over_members(lambda latitude: tuple(chart_scales(latitude)), ())
-_level_axes = {
-    earth: over_members(lambda r_e, earth=earth: level_axes(r_e, earth), (3,)) for earth in EARTHS
-}
-
-
-def geodetic_of(
-    r_e: FloatArray, earth: str, origin: tuple[FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Latitude, longitude [rad] and height [m], (k,), of positions (k, 3) on an Earth.
-
-    The origin (k,), (k,) is that of the flat Earth, in the scales of whose place north and east are
-    drawn.
-    """
-    if rotation_rate(earth):
-        latitude, longitude, height = geodetic_from_ecef_array(r_e)
-        return latitude, longitude, height
-    north, east = _scales(origin[0])
-    return origin[0] + r_e[:, 0] / north, origin[1] + r_e[:, 1] / east, -r_e[:, 2]
-
-
-def level_axes_of(r_e: FloatArray, earth: str) -> FloatArray:
-    """Transformations (k, 3, 3) from e to north, east, down at positions (k, 3)."""
-    found: FloatArray = _level_axes[earth](r_e)
-    return np.broadcast_to(found, (len(r_e), 3, 3))
 
 
 def dem_of(told: Mapping[str, Any]) -> Dem:
@@ -93,7 +64,7 @@ def clearance_observation(state: ErrorState, earth: str) -> EnsembleObservation:
 
     def derivative(estimate: Arrays, told: Arrays) -> NDArray[Any]:
         dem, latitude, longitude, _ = where(estimate, told)
-        north, east = _scales(latitude if rotation_rate(earth) else told[ORIGIN[0]].reshape(-1))
+        north, east = scales_of(latitude if rotation_rate(earth) else told[ORIGIN[0]].reshape(-1))
         by_level = np.stack(
             [
                 -_rise(dem, latitude, longitude, dem.latitude_step, 0.0) / north,

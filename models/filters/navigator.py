@@ -37,9 +37,9 @@ from terrafix.models.filters.inertial import INERTIAL, inertial_process
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.process import Process
 from terrafix.models.geometry.frames import earth_rate_cross
-from terrafix.models.geometry.geodesy import geodetic_from_ecef
 from terrafix.models.geometry.quaternion import rotation_matrix
-from terrafix.models.motion.strapdown import gravity, rotation_rate
+from terrafix.models.motion.strapdown import gravity, height_of, rotation_rate
+from terrafix.models.sensors.aperture import CENTER, shift_of
 
 APERTURE = "aperture"
 """The instant of the clones: an aperture's center."""
@@ -64,9 +64,6 @@ DECAYS = {
 }
 """Time and sigma of each Gauss-Markov process."""
 
-CENTER = "t_center"
-"""Field of a fix: the time of its aperture's center [s]."""
-
 
 def navigator_process(state: ErrorState, earth: str) -> Process:
     """Strapdown mechanization on an Earth, biases that are Gauss-Markov.
@@ -87,33 +84,12 @@ def navigator_process(state: ErrorState, earth: str) -> Process:
     return inertial_process(state, earth, decays=decays)
 
 
-def height_of(r_e: Any, earth: str) -> Any:
-    """Height [m] above the ellipsoid, or the ground of a flat Earth, of a position (3,) [m]."""
-    return geodetic_from_ecef(r_e)[2] if rotation_rate(earth) else -r_e[2]
-
-
 def altimeter_observation(earth: str) -> Observation:
     """Height above the ellipsoid (or a flat ground), with a bias that is estimated."""
     rotation_rate(earth)
     return Observation(
         lambda x, _: height_of(x["r_e"], earth) + x["altimeter_bias"], {"height": "m"}
     )
-
-
-def shift_of(d: Any, v: Any, a: Any, speed: Any) -> Any:
-    """What an aperture measures about a point, without biases: (3, 1) [m], [m], [m/s].
-
-    Parameters
-    ----------
-    d : SX, shape (3,)
-        From the aperture's center to the point [m].
-    v, a : SX, shape (3,)
-        Velocity [m/s] and acceleration [m/s^2] relative to the point.
-    speed : SX
-        By which frequencies are turned into meters [m/s].
-    """
-    own = ca.norm_2(v)
-    return ca.vertcat(ca.norm_2(d), -ca.dot(d, v) / speed, own - ca.dot(d, a) / (2 * own))
 
 
 def shift_observation(earth: str) -> Observation:

@@ -127,6 +127,11 @@ def level_axes(r_e: Any, earth: str) -> Any:
     return ca.SX.eye(3)
 
 
+def height_of(r_e: Any, earth: str) -> Any:
+    """Height [m] above the ellipsoid, or the ground of a flat Earth, of a position (3,) [m]."""
+    return geodetic_from_ecef(r_e)[2] if rotation_rate(earth) else -r_e[2]
+
+
 def gravity(r_e: Any, earth: str) -> Any:
     """Gravity (3,) [m/s^2] in e at a position (3,) [m]: gravitation and centrifugal part."""
     if rotation_rate(earth):

@@ -12,8 +12,7 @@ from typing import Any
 import casadi as ca
 
 from terrafix.models.core.model import Model
-from terrafix.models.filters.navigator import height_of
-from terrafix.models.motion.strapdown import rotation_rate
+from terrafix.models.motion.strapdown import height_of, rotation_rate
 
 
 def wandering(bias: Any, sigma: Any, time: Any, drive: Any, dt: Any) -> Any:

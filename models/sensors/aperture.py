@@ -14,9 +14,8 @@ from typing import Any
 import casadi as ca
 
 from terrafix.models.core.model import Model
-from terrafix.models.filters.navigator import CENTER, height_of, shift_of
 from terrafix.models.geometry.quaternion import from_rotation_vector, rotation_matrix
-from terrafix.models.motion.strapdown import at_end, level_axes, rotation_rate
+from terrafix.models.motion.strapdown import at_end, height_of, level_axes, rotation_rate
 from terrafix.models.sensors.altimeter import wandering
 
 LOOKS = ("right", "left", "in-turn")
@@ -24,6 +23,26 @@ LOOKS = ("right", "left", "in-turn")
 
 ROWS = ("shift", "shift-and-drift")
 """Names of what is measured: range and cross-range, or what map drift reads besides."""
+
+
+CENTER = "t_center"
+"""Field of a fix: the time of its aperture's center [s]."""
+
+
+def shift_of(d: Any, v: Any, a: Any, speed: Any) -> Any:
+    """What an aperture measures about a point, without biases: (3, 1) [m], [m], [m/s].
+
+    Parameters
+    ----------
+    d : SX, shape (3,)
+        From the aperture's center to the point [m].
+    v, a : SX, shape (3,)
+        Velocity [m/s] and acceleration [m/s^2] relative to the point.
+    speed : SX
+        By which frequencies are turned into meters [m/s].
+    """
+    own = ca.norm_2(v)
+    return ca.vertcat(ca.norm_2(d), -ca.dot(d, v) / speed, own - ca.dot(d, a) / (2 * own))
 
 
 def aperture_model() -> Model:

@@ -41,6 +41,7 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("last_known_orbit", "orbit_evaluation", "orbit_evaluation_considered"),
     *("orbit_predict", "orbit_predict_considered"),  # in systems/test_leo_lake
     "radar_altimeter",  # in sensors/test_aircraft_sensors
+    "synthetic_shift",  # of apertures that end: in systems/test_aircraft
     *("clearance_correct", "clearance_correct_radar"),  # in filters/test_clearance
 }
 FOREIGN = {"fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
@@ -91,6 +92,12 @@ INPUTS = {
     "accepted": (1.0, 0.0),
     "reason": (0.0, 0.0),
 }
+INERTIAL = {
+    "velocity_random_walk": 1e-3,
+    "angle_random_walk": 1e-5,
+    "accel_bias_sigma": 1e-3,
+    "gyro_bias_sigma": 1e-5,
+}
 SETTINGS = {
     "antenna_mount": {"misalignment_sigma0": 1e-3, "misalignment_walk": 1e-4},
     "attitude_sensor": {"noise_sigma": 1e-4, "bias_sigma": 1e-3},
@@ -106,15 +113,8 @@ SETTINGS = {
         "gyro_bias_sigma0": 1e-6,
         "gyro_bias_walk": 1e-8,
     },
-    **dict.fromkeys(
-        ("inertial_predict", "inertial_predict_radar"),
-        {
-            "velocity_random_walk": 1e-3,
-            "angle_random_walk": 1e-5,
-            "accel_bias_sigma": 1e-3,
-            "gyro_bias_sigma": 1e-5,
-        },
-    ),
+    "inertial_predict": INERTIAL,
+    "inertial_predict_radar": INERTIAL,
     "mekf_correct": {"look": 0.6},
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "mekf_predict_smoothed": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
@@ -150,6 +150,8 @@ class Inputs(Component):
         mean, sigma = INPUTS[name]
         mean = np.asarray(mean)[tuple(slice(n) for n in field.shape)]  # of P, what is needed
         noise = self.normals(stream, field.size).reshape(-1, *field.shape)
+        if np.ndim(sigma):
+            sigma = sigma[tuple(slice(n) for n in field.shape)]
         return mean + sigma * noise
 
 

@@ -276,3 +276,22 @@ def test_a_navigator_whose_apertures_nobody_marks_is_refused():
 def test_a_grade_that_does_not_exist_is_refused():
     with pytest.raises(TerrafixError, match="CPT7"):
         tf.read_system(RADAR, [("imu.grade", "CPT8")])
+
+
+def test_a_member_alone_is_the_member_of_the_ensemble(skeleton):
+    settings = [("radar.rows", "shift-and-drift"), ("radar.looks", "in-turn")]
+
+    def build():
+        system = tf.read_system(RADAR, settings)
+        for name, ports in PORTS.items():
+            system.record(name, [system[name][port] for port in ports])
+        system.duration = 2
+        return system
+
+    skeleton.check_determinism(build, 5, [3])
+
+
+PORTS = {
+    "radar": ("fix", "range_bias", "cross_range_bias"),
+    "correct_shift": ("estimate", "innovation"),
+}

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from terrafix.models.filters.contours import clearance_observation, level_axes_of
+from terrafix.models.filters.contours import clearance_observation
 from terrafix.models.filters.navigator import DRIFTING
 from terrafix.models.geometry.geodesy import ecef_from_geodetic_array
+from terrafix.models.maps.charts import level_axes_of
 from terrafix.models.maps.dem import Dem
 from terrafix.models.motion.strapdown import EARTHS
 
