@@ -81,7 +81,9 @@ class ApertureMatcher(OnGround):
     fix = MessageOutput(fields=SHIFT_FIX, doc="the fix")
     reason = Output(doc="index into terrafix.models.images.aperture_matching.REASONS")
     quality = Output(doc="of the last image: height of the peak over the rms of the correlation")
-    residual = Output((2,), unit="m", labels=("range", "cross_range"), doc="measured, less expected")
+    residual = Output(
+        (2,), unit="m", labels=("range", "cross_range"), doc="measured, less expected"
+    )
     offset = Output((3,), unit="m", frame="e", labels=XYZ, doc="of the track, as the image has it")
 
     def takes(self, name: str) -> bool:
@@ -131,7 +133,9 @@ class ApertureMatcher(OnGround):
         reach = search_reach(S[0], float(self.search_sigmas[m]))
         return matched_aperture(image, own, reference, dem.at, reach)
 
-    def _publish(self, t: float, grids: dict[int, PixelGrid], found: dict[int, ApertureFix]) -> None:
+    def _publish(
+        self, t: float, grids: dict[int, PixelGrid], found: dict[int, ApertureFix]
+    ) -> None:
         if not found:
             return
         n, who = self.n_members, np.array(list(found))
@@ -174,9 +178,16 @@ class ApertureMatcher(OnGround):
 
     def _grid(self, m: int, ground: Ground) -> PixelGrid:
         got = self.image
-        numbers = (got.first_time, got.row_time, got.near_range, got.spacing, got.velocity)
-        line = StraightLine(float(got.t[m]), got.r_e[m].copy(), got.v_e[m].copy())
-        return PixelGrid(*(float(v[m]) for v in numbers), line, ground, int(got.side[m]))
+        return PixelGrid(
+            float(got.first_time[m]),
+            float(got.row_time[m]),
+            float(got.near_range[m]),
+            float(got.spacing[m]),
+            float(got.velocity[m]),
+            StraightLine(float(got.t[m]), got.r_e[m].copy(), got.v_e[m].copy()),
+            ground,
+            int(got.side[m]),
+        )
 
     def _reference(self) -> Reference:
         places = self.places
@@ -231,9 +242,7 @@ class ApertureMatcher(OnGround):
         )
         raise ConfigurationError(f"the image is not on the reference of '{self.name}': {told}")
 
-    def _require_pixels(
-        self, reference: Reference, own: PixelGrid, shape: tuple[int, int]
-    ) -> None:
+    def _require_pixels(self, reference: Reference, own: PixelGrid, shape: tuple[int, int]) -> None:
         i, j = (k // 2 for k in reference.latitude.shape)
         at = [
             own.ground.point(a[0], a[1], a[2])

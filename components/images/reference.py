@@ -38,7 +38,6 @@ from terrafix.models.radar.imaging import Imager
 from terrafix.models.sensors.aperture import LOOKS
 from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
-
 _TRACK_STEP = 0.02
 """Between places of an earlier flight [s]."""
 
@@ -175,7 +174,7 @@ class EarlierFlight(_Reference, OnGround):
         right = np.cross(down, ahead)
         right /= np.linalg.norm(right)
         r = r + displacement @ np.stack([ahead, right, np.cross(ahead, right) * -1.0])
-        radar = replace(Radar(*map(float, self.radar)), doppler_bandwidth=speed / resolution)
+        radar = replace(Radar(*map(float, self.radar)), doppler_bandwidth=float(speed / resolution))
         reach = float(length) / speed
         s = np.arange(-reach, reach + _TRACK_STEP, _TRACK_STEP)
         n_lines = int(reach * radar.prf)

@@ -40,7 +40,7 @@ from terrafix.models.sensors.aperture import LOOKS
 
 _CLOSE = 1e-6
 _LOST = 1, 2
-"""What `state` says of an aperture without an echo: the beam was off the swath; it cannot be."""
+"""What `lost` says of an aperture without an echo: the beam was off the swath; it cannot be."""
 
 
 class AircraftRadar(OnGround):
@@ -140,24 +140,21 @@ class AircraftRadar(OnGround):
         scene = scene_from(self.height, self.grid, self.surface)
         echoes: list[ComplexArray] = []
         values = {n: np.zeros((self.n_members, *f.fixed_shape)) for n, f in PULSES.items()}
-        valid, first = np.zeros(self.n_members, np.bool_), None
+        valid = np.zeros(self.n_members, np.bool_)
+        first: ValueError | None = None
         for m in map(int, np.flatnonzero(fresh)):
             try:
                 antenna = self._antenna(self._side(int(self.center.index[m])))
                 echo = self._echo(m, antenna, scene)
-            except _OffSwathError as error:
-                first = first or error
-                self.lost[m] = _LOST[0]
-                continue
             except ValueError as error:
                 first = first or error
-                self.lost[m] = _LOST[1]
+                self.lost[m] = _LOST[0 if isinstance(error, _OffSwathError) else 1]
                 continue
             self.lost[m], valid[m] = 0, True
             values["index"][m] = len(echoes)
             values["side"][m], values["axis_b"][m] = antenna.side, antenna.axis
             echoes.append(echo)
-        if first is not None and (self.step_index <= 1 and not valid.any()):
+        if first is not None and self.step_index <= 1 and not valid.any():
             raise ConfigurationError(f"'{self.name}' receives no echo: {first}") from first
         broken = fresh & (self.lost == _LOST[1])
         self.fail(broken, f"no echo can be simulated: {first}")

@@ -267,7 +267,7 @@ def _fix(
     offset: FloatArray,
     quality: float,
 ) -> ApertureFix:
-    middle = [(n - 1) / 2 for n in shape]
+    middle = (shape[0] - 1) / 2, (shape[1] - 1) / 2
     place = image.places(*middle, terrain, offset)
     rho, ahead = image.seen(middle[0] + shift.pixels[0], middle[1] + shift.pixels[1])
     predicted = image.predicted(place)
