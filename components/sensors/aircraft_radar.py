@@ -178,8 +178,8 @@ class AircraftRadar(OnGround):
             near_range=float(self.near_range[0]),
             n_cells=self.n_cells,
         )
-        self._require_lit(antenna, own, scene, q[len(q) // 2])
         lit = LitGround(scene, self._ground, own)
+        self._require_lit(antenna, own, scene, q[len(q) // 2])
         rng = generator(self, m)
         parts = [lit.clutter(rng, float(self.scatterers[0])), lit.points()]
         return pulse_echo(parts, own, pulse_sums(), rng, snr_db=float(self.snr[0]))
