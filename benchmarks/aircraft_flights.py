@@ -27,6 +27,7 @@ RECORDED = {
     "flight": ("r_e", "v_e"),
     "matcher": ("fix", "reason", "quality", "residual"),
     "radar": ("lost",),
+    "former": ("image",),
 }
 WRONG = 3.0
 """What an accepted fix must not be off by [m]."""
@@ -57,6 +58,9 @@ def fly(k: int, seconds: float, settings: list[tuple[str, str]]) -> dict[str, An
         size - np.einsum("ij,ij->i", d, a) / (2 * size),
     ]
     fixed = get["matcher.reason"][ends] == 0
+    focused = get["former.image.focused"][ends] > 0
+    read = np.linalg.norm(get["former.image.v_e"][ends], axis=1) + get["former.image.drift"][ends]
+    flown = np.linalg.norm(r[ends] - r[ends - 2], axis=1)
     return {
         "error": (y - np.stack(true, axis=1))[fixed],
         "claim": np.sqrt(np.diagonal(R, axis1=1, axis2=2))[fixed],
@@ -64,6 +68,7 @@ def fly(k: int, seconds: float, settings: list[tuple[str, str]]) -> dict[str, An
         "at": np.arange(1, n + 1)[fixed],
         "reason": get["matcher.reason"][ends],
         "lost": get["radar.lost"][ends],
+        "speed": (read - flown)[focused],
         "cost": spent / n,
         **{
             name: get[f"evaluation.{name}"]
@@ -101,6 +106,11 @@ def told(flights: list[dict[str, Any]]) -> str:
             f"(its standard error over flights {error_of_mean:.4f}), rms over claimed "
             f"{np.sqrt(np.mean(e**2) / np.mean(s**2)):.2f}, largest {np.abs(e).max():.3f}"
         )
+    speed = np.concatenate([f["speed"] for f in flights])
+    lines.append(
+        f"map drift accepted in {len(speed)} of {asked}; what it reads less the true speed: rms "
+        f"{np.sqrt(np.mean(speed**2)):.3f}, largest {np.abs(speed).max(initial=0):.3f} m/s"
+    )
     nees = np.array([f["nees"][1:] for f in flights])
     low, high = chi2.ppf([0.025, 0.975], 16 * len(flights)) / len(flights)
     inside = ((nees.mean(axis=0) > low) & (nees.mean(axis=0) < high)).mean()

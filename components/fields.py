@@ -249,3 +249,22 @@ APERTURE_IMAGE = {
     "focused": Field((), "1", doc="1 where map drift found it, 0 where it refused"),
 }
 """An image of an aperture, formed with a member's own track; valid at the aperture's center."""
+
+PHASE: dict[str, Any] = {"shape": (None, None), "dtype": np.complex64}
+"""Phase history of a spotlight radar: pulses, frequencies."""
+
+TRACK_ERROR = {
+    "position": Field((3,), "m", "scene", labels=XYZ, doc="believed less true, in the middle"),
+    "velocity": Field((3,), "m/s", "scene", labels=XYZ, doc="believed less true"),
+}
+"""What a believed track is off by."""
+
+SPOTLIGHT_FIX = {
+    "range": Field((), "m", doc="from the middle of the track to the middle of the scene"),
+    "ahead": Field((), "m", doc="distance of the middle of the scene ahead of it, by Doppler"),
+    "speed": Field((), "m/s", doc="believed, by which Doppler frequencies are meters"),
+    "velocity": Field((), "m/s", doc="that focuses the image"),
+    "focused": Field((), "1", doc="1 where map drift found it, 0 where it refused"),
+    "accepted": Field((), "1", doc="1 where the image was recognized, else 0"),
+}
+"""What a spotlight image says about its track."""

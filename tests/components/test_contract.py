@@ -30,6 +30,7 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("recorded_echo", "recorded_reference", "reference_file", "scene_echo", "terrain"),
     *("aircraft_radar", "aperture_former", "aperture_matcher"),
     "earlier_flight",  # in systems/test_aircraft_sar
+    *("recorded_spotlight", "spotlight_matcher", "spotlight_evaluation"),  # in test_aircraft_gotcha
     "lake_catalog",  # and of maps of lakes: in truth/test_lakes
     *(
         "image_moments",
