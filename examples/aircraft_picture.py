@@ -24,8 +24,8 @@ from terrafix.models.radar.compensation import StraightLine
 SYSTEM = Path(__file__).parent / "aircraft_sar.toml"
 LOST = [
     ("last_known.position_sigma", "[10, 5, 5] m"),
-    ("last_known.velocity_sigma", "[2, 0.3, 0.3] m/s"),
-    ("seed", "7"),
+    ("last_known.velocity_sigma", "[1.5, 0.3, 0.3] m/s"),
+    ("seed", "12"),
 ]
 """What is known at the start: less than in the example, so that it shows in the first image."""
 AXES = ("north", "east", "down")

@@ -1,5 +1,6 @@
 """A wrong track, recovered from recorded X-band echo by a system of components."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -9,14 +10,16 @@ import pytest
 import terrafix as tf
 from terrafix.cosim.basics.errors import TerrafixError
 
-SYSTEM = Path(__file__).parents[2] / "examples" / "aircraft_gotcha.toml"
+ROOT = Path(__file__).parents[2]
+SYSTEM = ROOT / "examples" / "aircraft_gotcha.toml"
+GOTCHA = Path(os.environ.get("TERRAFIX_DATA", ROOT.parent / "shared" / "data")) / "afrl_gotcha"
 
 
 @pytest.mark.parametrize("errors", ["small", "large"])
-def test_a_wrong_track_is_recovered_from_another_aspect(errors, data_folder):
+def test_a_wrong_track_is_recovered_from_another_aspect(errors):
     """Two draws each, within three of the rms that 80 may have: 0.08 m, 0.25 m, 0.06 m/s."""
-    if not (data_folder / "afrl_gotcha").is_dir():
-        pytest.skip(f"no phase history: {data_folder / 'afrl_gotcha'} is absent")
+    if not GOTCHA.is_dir():
+        pytest.skip(f"no phase history: {GOTCHA} is absent")
     system = tf.read_system(SYSTEM, [("errors", errors)])
     data = tf.simulate(system, members=2).dataset
     assert (data["evaluation.accepted"].values[-1] == 1).all()
