@@ -52,6 +52,7 @@ benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/verdicts.py
 	$(BIN)/python benchmarks/aircraft_images.py
 	$(BIN)/python benchmarks/aircraft.py
+	$(BIN)/python benchmarks/aircraft_flights.py --flights 2 --seconds 10
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
 	    then $(BIN)/python benchmarks/real_echo.py; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/afrl_gotcha"; \

@@ -58,7 +58,7 @@ def fixes(scenario: Any, scene: Any, n: int, flight: dict[str, Any]) -> dict[str
         seen = scenario.seen_by(echo, t, believed, axis, height)
         drift = map_drift(seen.domain, seen.speed)
         image = aperture_image(seen, drift.velocity)
-        fix = matched_aperture(image, reference, scene.dem.at)
+        fix = matched_aperture(image.amplitude(), image.grid, reference, scene.dem.at)
         cost.append(time.process_time() - start)
         if drift.accepted:
             drifts.append(drift.velocity - scenario.SPEED)

@@ -96,8 +96,8 @@ GRID: dict[str, Any] = {
 }
 """Where the heights of a terrain lie: its first point, its spacing, and 1 where it is mirrored."""
 
-SURFACE: dict[str, Any] = {"shape": (6,)}
-"""What a terrain looks like to a radar: seed, strengths of its texture, its bright points."""
+SURFACE: dict[str, Any] = {"shape": (7,)}
+"""What a terrain looks like to a radar: seed, strengths of its texture, bright points, detail."""
 
 AMPLITUDE: dict[str, Any] = {"shape": (None, None), "dtype": np.float32}
 """Amplitude of a geocoded reference: rows, columns."""
@@ -280,3 +280,49 @@ MOTION = {
     "P": Field((24, 24), "1", doc="covariance of the error, in units of its elements"),
 }
 """What the navigator of an aircraft with a radar knows."""
+
+PULSES = {
+    "index": Field((), "1", doc="which of the shared echoes is this member's"),
+    "near_range": Field((), "m", doc="slant range of the first cell"),
+    "side": Field((), "1", doc="1: to the right of the track, -1: to the left"),
+    "axis_b": Field((3,), "1", "b", labels=XYZ, doc="along the antenna's long side"),
+    "length": Field((), "s", doc="of the aperture"),
+}
+"""How an aperture was received, from a track; valid at its center."""
+
+APERTURE_IMAGE = {
+    "index": Field((), "1", doc="which of the shared images is this member's"),
+    "rows": Field((), "1", doc="of it"),
+    "columns": Field((), "1", doc="of it"),
+    "first_time": Field((), "s", doc="of zero Doppler of row 0, after the center"),
+    "row_time": Field((), "s", doc="between rows"),
+    "near_range": Field((), "m", doc="closest range of column 0"),
+    "spacing": Field((), "m", doc="closest range between columns"),
+    "velocity": Field((), "m/s", doc="that it was focused with"),
+    "r_e": Field((3,), "m", "e", labels=XYZ, doc="of the line's middle, as estimated"),
+    "v_e": Field((3,), "m/s", "e", labels=XYZ, doc="of the line, as estimated"),
+    "side": Field((), "1", doc="1: to the right of the track, -1: to the left"),
+    "drift": Field((), "m/s", doc="what map drift found, less the speed of the line"),
+    "drift_sigma": Field((), "m/s", doc="its standard error"),
+    "focused": Field((), "1", doc="1 where map drift found it, 0 where it refused"),
+}
+"""An image of an aperture, formed with a member's own track; valid at the aperture's center."""
+
+PHASE: dict[str, Any] = {"shape": (None, None), "dtype": np.complex64}
+"""Phase history of a spotlight radar: pulses, frequencies."""
+
+TRACK_ERROR = {
+    "position": Field((3,), "m", "scene", labels=XYZ, doc="believed less true, in the middle"),
+    "velocity": Field((3,), "m/s", "scene", labels=XYZ, doc="believed less true"),
+}
+"""What a believed track is off by."""
+
+SPOTLIGHT_FIX = {
+    "range": Field((), "m", doc="from the middle of the track to the middle of the scene"),
+    "ahead": Field((), "m", doc="distance of the middle of the scene ahead of it, by Doppler"),
+    "speed": Field((), "m/s", doc="believed, by which Doppler frequencies are meters"),
+    "velocity": Field((), "m/s", doc="that focuses the image"),
+    "focused": Field((), "1", doc="1 where map drift found it, 0 where it refused"),
+    "accepted": Field((), "1", doc="1 where the image was recognized, else 0"),
+}
+"""What a spotlight image says about its track."""

@@ -23,10 +23,15 @@ def common(component: Component, name: str) -> FloatArray:
     return np.asarray(values[0])
 
 
-def generator(component: Component) -> np.random.Generator:
-    """Noise of a step, one for all members: of the root seed, the component and its step alone."""
+def generator(component: Component, member: int | None = None) -> np.random.Generator:
+    """Noise of a step: of the root seed, the component and its step alone, and of a member.
+
+    One for all members if none is named; a member is one of those flown here, by its place.
+    """
     env = component.environment
     words = [env.seed & 0xFFFFFFFF, env.seed >> 32, component.step_index, *env.path.encode()]
+    if member is not None:
+        words += [int(env.members[member]) + 1]
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
 
 

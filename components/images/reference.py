@@ -5,11 +5,14 @@ A reference is one for all members, published by reference before the image that
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from terrafix.components.fields import AMPLITUDE, GRID, HEIGHT, PLACES, RADAR, SURFACE, TIES
+from terrafix.components.ground import OnGround
+from terrafix.components.sensors.aperture import MARK
 from terrafix.components.sensors.files import (
     file_of_step,
     read_lines,
@@ -21,17 +24,22 @@ from terrafix.components.truth.terrain import dem_from, scene_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.parameters import Count, FilePath, Parameter, Text
-from terrafix.cosim.declare.ports import Input, SharedInput, SharedOutput
+from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Parameter, Text
+from terrafix.cosim.declare.ports import Input, MessageInput, SharedInput, SharedOutput
 from terrafix.models.geometry.geolocation import track_axes
 from terrafix.models.images.reference import Reference, earlier_pass, geocoded, read_reference
 from terrafix.models.motion.arc import OrbitArc
+from terrafix.models.motion.sampled import SampledArc
 from terrafix.models.radar.boresight import boresight_on_terrain
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.doppler import unwrapped_centroid
 from terrafix.models.radar.footprint import Footprint
 from terrafix.models.radar.imaging import Imager
+from terrafix.models.sensors.aperture import LOOKS
 from terrafix.models.sensors.effective_velocity import effective_velocity_array
+
+_TRACK_STEP = 0.02
+"""Between places of an earlier flight [s]."""
 
 
 class _Reference(Component):
@@ -109,6 +117,88 @@ class EarlierPass(_Reference):
                 beam.doppler(radar.wavelength),
             )
             reference = earlier_pass(scene, footprint, looks, generator(self), float(snr))
+        except ValueError as error:
+            raise ConfigurationError(f"'{self.name}' cannot see its scene: {error}") from error
+        self._publish(reference)
+
+
+class EarlierFlight(_Reference, OnGround):
+    """Reference of an earlier flight over an artificial scene, with speckle of its own.
+
+    As `EarlierPass`, of a straight piece of a track, displaced, about where the given one is when
+    it steps. Let another flight than the one that navigates tell it where it was. The places of its
+    pixels are found with the heights that were known then.
+    """
+
+    default_rate = Rate("1", offset="0.5")
+
+    looks = Choice(LOOKS, "right", doc="side that apertures look to")
+    displacement = Parameter(
+        [0.0, 30.0, 20.0],
+        shape=(3,),
+        unit="m",
+        frame="track",
+        doc="of the earlier track: along, to the right, up",
+    )
+    length = Parameter(400.0, unit="m", positive=True, doc="of the track that a reference is of")
+    near_range = Parameter(unit="m", positive=True, doc="slant range of the first cell")
+    n_cells = Count(520, minimum=64, doc="range cells of the reference")
+    azimuth_looks = Count(3, minimum=1, doc="lines averaged in a pixel")
+    resolution = Parameter(0.35, unit="m", positive=True, doc="along the track")
+    snr = Parameter(10.0, doc="mean clutter over thermal noise [dB]")
+
+    radar = SharedInput(**RADAR, doc="what the radar sends and how its echo is sampled")
+    r_e = Input((3,), unit="m", frame="e", doc="true position of the flight")
+    v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
+    center = MessageInput(fields=MARK, doc="now is the center of an aperture")
+    height = SharedInput(**HEIGHT, doc="true heights of the terrain")
+    grid = SharedInput(**GRID, doc="where they lie")
+    surface = SharedInput(**SURFACE, doc="texture and points of the surface")
+    known_height = SharedInput(**HEIGHT, doc="heights that its places are found with")
+    known_grid = SharedInput(**GRID, doc="where those lie")
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        fresh = self.center.fresh
+        if not fresh.any():
+            return
+        index = int(self.center.index[np.argmax(fresh)])
+        side = {"right": 1, "left": -1}.get(self.looks, 1 - 2 * (index % 2))
+        r, v, displacement, near, length, resolution, snr = (
+            common(self, name)
+            for name in (
+                *("r_e", "v_e", "displacement", "near_range", "length", "resolution", "snr"),
+            )
+        )
+        speed, ground = float(np.linalg.norm(v)), self._ground
+        ahead, down = v / speed, ground.axes(r)[2]
+        right = np.cross(down, ahead)
+        right /= np.linalg.norm(right)
+        r = r + displacement @ np.stack([ahead, right, np.cross(ahead, right) * -1.0])
+        radar = replace(Radar(*map(float, self.radar)), doppler_bandwidth=float(speed / resolution))
+        reach = float(length) / speed
+        s = np.arange(-reach, reach + _TRACK_STEP, _TRACK_STEP)
+        n_lines = int(reach * radar.prf)
+        scene = scene_from(self.height, self.grid, self.surface)
+        try:
+            footprint = Footprint(
+                SampledArc(s, r + np.outer(s, v)),
+                radar,
+                -(n_lines - 1) / 2 / radar.prf,
+                n_lines,
+                float(near),
+                self.n_cells,
+                0.0,
+                ground,
+                side,
+            )
+            reference = earlier_pass(
+                scene,
+                footprint,
+                (self.azimuth_looks, 1),
+                generator(self),
+                float(snr),
+                terrain=dem_from(self.known_height, self.known_grid).at,
+            )
         except ValueError as error:
             raise ConfigurationError(f"'{self.name}' cannot see its scene: {error}") from error
         self._publish(reference)

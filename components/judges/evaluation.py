@@ -104,6 +104,15 @@ class RadarInertialEvaluation(InertialEvaluation):
     }
 
 
+class ImageInertialEvaluation(RadarInertialEvaluation):
+    """The same where images are formed: what they are biased by has no truth, and is not judged."""
+
+    judged = (*_INERTIAL, "altimeter_bias")
+
+    range_bias = Input((1,), unit="m", optional=True, doc="truth: none is known")
+    cross_range_bias = Input((1,), unit="m", optional=True, doc="truth: none is known")
+
+
 class RadarContourEvaluation(RadarInertialEvaluation):
     """The same of a navigator with a radar that matches contours of the terrain, too."""
 

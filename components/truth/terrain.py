@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,11 +16,20 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import SharedOutput
 from terrafix.models.core.arrays import Single
-from terrafix.models.maps.dem import HIGHEST, LOWEST, Dem, flat_dem, read_dem, read_jacksboro
+from terrafix.models.maps.dem import (
+    HIGHEST,
+    LOWEST,
+    Dem,
+    flat_dem,
+    read_dem,
+    read_jacksboro,
+    rolling_dem,
+)
 from terrafix.models.radar.scene import Scene
 
 _log = logging.getLogger(__name__)
-SOURCES = ("file", "jacksboro", "flat")
+SOURCES = ("file", "jacksboro", "flat", "hills")
+_OF_HILLS = ("relief", "relief_length", "relief_seed", "error", "error_length", "error_seed")
 
 
 class Terrain(Component):
@@ -33,15 +43,24 @@ class Terrain(Component):
     source = Choice(
         SOURCES,
         "file",
-        doc="file; jacksboro: the real one that comes with matplotlib; flat: one height",
+        doc="file; jacksboro: the real one that comes with matplotlib; flat: one height; hills",
     )
     dem_file = OptionalFilePath(doc="tile of SRTM (.hgt) or arrays (.npz)")
     flat_height = Parameter(
         0.0, unit="m", minimum=LOWEST, maximum=HIGHEST, doc="height everywhere (flat); 0 is the sea"
     )
+    relief = Parameter(10.0, unit="m", minimum=0.0, doc="rms height (hills)")
+    relief_length = Parameter(150.0, unit="m", positive=True, doc="its correlation (hills)")
+    relief_seed = Count(0, maximum=2**32, doc="of the heights (hills)")
+    error = Parameter(
+        0.0, unit="m", minimum=0.0, doc="rms by which these are not the true heights (hills)"
+    )
+    error_length = Parameter(150.0, unit="m", positive=True, doc="correlation of the error (hills)")
+    error_seed = Count(1, maximum=2**32, doc="of the error (hills)")
     mirrored = Flag(False, doc="go on for ever in mirror images: artificial, without borders")
     fill_voids = Flag(False, doc="interpolate voids, and say so, instead of refusing them")
     surface_seed = Count(0, maximum=2**53, doc="of texture and bright points")
+    detail = Count(1, minimum=1, doc="how fine texture is: 1 from orbit, 10 from an aircraft")
     parcels = Parameter(2.5, minimum=0.0, doc="texture with sharp borders, standard deviation [dB]")
     smooth = Parameter(1.5, minimum=0.0, doc="smooth texture, standard deviation [dB]")
     fine = Parameter(1.5, minimum=0.0, doc="fine texture, standard deviation [dB]")
@@ -50,7 +69,7 @@ class Terrain(Component):
 
     height = SharedOutput(**HEIGHT, doc="heights, southernmost row first")
     grid = SharedOutput(**GRID, doc="first point and spacing; whether mirrored")
-    surface = SharedOutput(**SURFACE, doc="seed and strength of the texture, points")
+    surface = SharedOutput(**SURFACE, doc="seed, strength, points, detail of the texture")
 
     def validate(self) -> None:
         """Read the elevation model."""
@@ -61,6 +80,8 @@ class Terrain(Component):
         self._n_filled = 0
         if source == "flat":
             return flat_dem(float(shared_setting(self, "flat_height")))
+        if source == "hills":
+            return self._hills()
         if source == "file" and path is None:
             raise ConfigurationError(
                 f"'{self.name}' needs an elevation model\n"
@@ -82,6 +103,27 @@ class Terrain(Component):
                 f"  set {self.name}.fill_voids = true, or use another"
             )
         return dem.tiled() if self.setting("mirrored") else dem
+
+    def _hills(self) -> Dem:
+        """Artificial heights, and an error of them where one is asked for."""
+        parts = []
+        for what in ("relief", "error"):
+            rms, length = (float(shared_setting(self, f"{what}{k}")) for k in ("", "_length"))
+            try:
+                parts.append(rolling_dem(rms, length, self.setting(f"{what}_seed")))
+            except ValueError as error:
+                raise ConfigurationError(
+                    f"'{self.name}' cannot make its hills: {error}\n  set {self.name}.{what}_length"
+                ) from error
+        true, wrong = parts
+        return replace(true, height=true.height + wrong.height)
+
+    def takes(self, name: str) -> bool:
+        """Whether a setting has any effect: heights of hills have where there are hills."""
+        hills = self.setting("source") == "hills"
+        if name in _OF_HILLS:
+            return hills and (not name.startswith("error_") or float(self.setting("error")) > 0)
+        return super().takes(name) and not (hills and name in ("mirrored", "fill_voids"))
 
     def _initialize_impl(self) -> None:
         require_common(self)
@@ -108,7 +150,9 @@ class Terrain(Component):
             self.point_density,
             self.point_brightness,
         )
-        self.surface = np.array([float(self.surface_seed), *(float(s[0]) for s in strengths)])
+        self.surface = np.array(
+            [float(self.surface_seed), *(float(s[0]) for s in strengths), float(self.detail)]
+        )
 
     def _step_impl(self, t: float, dt: float) -> None:
         """Say nothing more."""
@@ -122,6 +166,7 @@ def dem_from(height: Single, grid: FloatArray) -> Dem:
 
 def scene_from(height: Single, grid: FloatArray, surface: FloatArray) -> Scene:
     """What the ground looks like to a radar, from the ports of a terrain."""
-    seed, *strengths = (float(s) for s in surface)
-    parcels, smooth, fine, density, brightness = strengths
-    return Scene(dem_from(height, grid), int(seed), parcels, smooth, fine, density, brightness)
+    seed, parcels, smooth, fine, density, brightness, detail = (float(s) for s in surface)
+    return Scene(
+        dem_from(height, grid), int(seed), parcels, smooth, fine, density, brightness, int(detail)
+    )

@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike
 from terrafix.models.core.arrays import FloatArray, Single
 from terrafix.models.geometry.geolocation import Height
 from terrafix.models.images.reference import Reference
-from terrafix.models.radar.aperture_image import ApertureImage
+from terrafix.models.radar.aperture_image import PixelGrid
 from terrafix.models.radar.correlation import Shift, contrast, shift_between
 
 GATE = 7.0
@@ -43,10 +43,11 @@ PARTS = 2.7
 """Parts of the image that must hold the peak, of 16. On mirrored images, simulated and recorded,
 peaks above the gate are held by 1 to 2.4; right ones by 6 and more over texture and points, and by
 3 to 5 in fields with nothing but bright points, of which one in eight is refused."""
-FLOOR = (0.07, 0.08)
-"""Standard deviation of z_r and z_c that no image goes below [m]: a quarter of a pixel, as bright
-points of both passes fall between pixels, and an error of velocity shears the image. Measured by
-``benchmarks/aircraft_images.py``."""
+FLOOR = (0.04, 0.05)
+"""Standard deviation of z_r and z_c that no image goes below [m]: a seventh of a pixel, as bright
+points of both passes fall between pixels, and an error of velocity shears the image. Measured on
+flights (``benchmarks/aircraft_flights.py``); with errors of 3 m and 0.1 m/s, as a navigator has
+before its first fix, twice as much (``benchmarks/aircraft_images.py``)."""
 NARROWEST = (25.0, 12.0)
 """Least reach of a search, along the track and in range [m]."""
 WIDEST = (220.0, 60.0)
@@ -122,7 +123,8 @@ def search_reach(covariance: ArrayLike, n_sigma: float = 3.0) -> tuple[float, fl
 
 
 def matched_aperture(
-    image: ApertureImage,
+    amplitude: Single,
+    image: PixelGrid,
     reference: Reference,
     terrain: Height,
     reach: tuple[float, float] = NARROWEST,
@@ -133,7 +135,10 @@ def matched_aperture(
 
     Parameters
     ----------
-    image : ApertureImage
+    amplitude : ndarray of float32, shape (n_rows, n_columns)
+        Of the image.
+    image : PixelGrid
+        Where its pixels lie.
     reference : Reference
     terrain : callable
         Height [m] at latitudes and longitudes [rad], as the navigator knows it.
@@ -142,7 +147,6 @@ def matched_aperture(
     gate : float
         Quality that is accepted.
     """
-    amplitude = image.amplitude()
     middle = (amplitude.shape[0] - 1) / 2, (amplitude.shape[1] - 1) / 2
     offset, quality = np.zeros(3), np.inf
     # what is far off is found with coarse pixels; then twice with fine ones
@@ -150,7 +154,7 @@ def matched_aperture(
     if max(reach) > _COARSE_FROM:
         searches = [(reach, _COARSE), (NARROWEST, 1), (NARROWEST, 1)]
     for k, (one, coarse) in enumerate(searches):
-        pixels = _in_pixels(image, one, coarse)
+        pixels = _in_pixels(image, amplitude.shape, one, coarse)
         warped, seen = _warped(image, reference, terrain, amplitude.shape, pixels, offset)
         if seen < _SEEN:
             return _refused(quality, REASONS[1])
@@ -164,27 +168,29 @@ def matched_aperture(
             return _refused(quality, REASONS[4])
         if k < len(searches) - 1:
             offset = _corrected(image, middle, shift.pixels, terrain, offset)
-    return _fix(image, middle, shift, terrain, offset, quality)
+    return _fix(image, amplitude.shape, shift, terrain, offset, quality)
 
 
-def _steps(image: ApertureImage) -> FloatArray:
-    """Distance ahead and range between pixels (2,) [m]."""
-    middle = image.pixel(float(image.image.slant_range.mean()), 0.0)
-    rho, ahead = image.seen(middle[0] + np.array([0.0, 1.0]), middle[1] + np.array([0.0, 0.0]))
-    rho2, _ = image.seen(middle[0], middle[1] + 1)
-    return np.array([float(ahead[1] - ahead[0]), float(rho2 - rho[0])])
+def pixel_steps(image: PixelGrid, shape: tuple[int, ...]) -> FloatArray:
+    """Distance ahead and range between pixels in the middle of an image (2,) [m]."""
+    middle = [(n - 1) / 2 for n in shape]
+    rho, ahead = image.seen(middle[0] + np.array([0.0, 1.0, 0.0]), middle[1] + np.array([0, 0, 1]))
+    return np.array([float(ahead[1] - ahead[0]), float(rho[2] - rho[0])])
 
 
-def _in_pixels(image: ApertureImage, reach: tuple[float, float], coarse: int) -> tuple[int, int]:
+def _in_pixels(
+    image: PixelGrid, shape: tuple[int, ...], reach: tuple[float, float], coarse: int
+) -> tuple[int, int]:
     """Reach in pixels, of which `coarse` make one."""
+    steps = pixel_steps(image, shape)
     rows, columns = (
-        int(np.ceil(m / s / coarse)) * coarse for m, s in zip(reach, _steps(image), strict=True)
+        int(np.ceil(m / s / coarse)) * coarse for m, s in zip(reach, steps, strict=True)
     )
     return rows, columns
 
 
 def _warped(
-    image: ApertureImage,
+    image: PixelGrid,
     reference: Reference,
     terrain: Height,
     shape: tuple[int, ...],
@@ -236,7 +242,7 @@ def _averaged(image: Single, n: int) -> Single:
 
 
 def _corrected(
-    image: ApertureImage,
+    image: PixelGrid,
     middle: tuple[float, float],
     pixels: FloatArray,
     terrain: Height,
@@ -255,18 +261,19 @@ def _corrected(
 
 
 def _fix(
-    image: ApertureImage,
-    middle: tuple[float, float],
+    image: PixelGrid,
+    shape: tuple[int, ...],
     shift: Shift,
     terrain: Height,
     offset: FloatArray,
     quality: float,
 ) -> ApertureFix:
+    middle = (shape[0] - 1) / 2, (shape[1] - 1) / 2
     place = image.places(*middle, terrain, offset)
     rho, ahead = image.seen(middle[0] + shift.pixels[0], middle[1] + shift.pixels[1])
     predicted = image.predicted(place)
     measured = np.array([float(rho), -float(ahead)])
-    steps = _steps(image)
+    steps = pixel_steps(image, shape)
     to_meters = np.array([[0.0, steps[1]], [-steps[0], 0.0]])
     covariance = to_meters @ shift.covariance @ to_meters.T + np.diag(np.square(FLOOR))
     residual = measured - np.array([float(predicted[0]), -float(predicted[1])])

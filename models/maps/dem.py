@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray, Single, read_arrays
 from terrafix.models.core.formats import kind_of
+from terrafix.models.geometry.earth import EARTH
 
 KEYS = ("height_m", "latitude0_deg", "longitude0_deg", "latitude_step_deg", "longitude_step_deg")
 """Arrays in a file of `write_dem`."""
@@ -226,6 +227,44 @@ def flat_dem(height: float = 0.0) -> Dem:
     """Everywhere the same height [m]: zero is the sea."""
     grid = np.full((2, 2), height, np.float32)
     return Dem(grid, 0.0, 0.0, 1.0, 1.0, "a flat elevation model", mirrored=True)
+
+
+_HILL_STEP, _HILL_POINTS = 10.0, 512
+"""Spacing [m] and number of the heights of rolling hills along each side."""
+
+
+def rolling_dem(rms: float, length: float, seed: int) -> Dem:
+    """Smooth random hills, going on for ever in mirror images: an artificial world.
+
+    White noise of every 10 m, smoothed by a Gaussian, so that heights a distance :math:`d` apart
+    correlate by :math:`e^{-(d / L)^2}`. Distances are those at the equator: elsewhere hills are
+    narrower from west to east.
+
+    Parameters
+    ----------
+    rms : float
+        Of the heights, whose mean is zero [m].
+    length : float
+        L [m].
+    seed : int
+
+    Raises
+    ------
+    ValueError
+        If hills are narrower than three spacings, or half as wide as the part that is mirrored.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    least, most = 3 * _HILL_STEP, _HILL_STEP * _HILL_POINTS / 2
+    if not least <= length <= most:
+        raise ValueError(f"hills are {least:.0f} to {most:.0f} m long, not {length:g} m")
+    noise = np.random.default_rng(seed).standard_normal((_HILL_POINTS, _HILL_POINTS))
+    smooth = gaussian_filter(noise, length / 2 / _HILL_STEP, mode="wrap")
+    smooth -= smooth.mean()
+    height = (smooth * (rms / smooth.std())).astype(np.float32)
+    step = _HILL_STEP / EARTH.radius
+    first = -step * (_HILL_POINTS // 2)
+    return Dem(height, first, first, step, step, "rolling hills").tiled()
 
 
 def _heights(raw: NDArray[Any], path: Path) -> Single:

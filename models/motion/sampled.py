@@ -63,7 +63,9 @@ class SampledArc:
                 f"times of a track run backward: {t[k + 1]:.6f} s comes after {t[k]:.6f} s"
             )
         self.start, self.stop = float(t[0]), float(t[-1])
-        self._spline = make_interp_spline(t, r, _DEGREE)
+        # near the middle: far from the origin of the frame derivatives would be rounded
+        self._middle = r[len(r) // 2]
+        self._spline = make_interp_spline(t, r - self._middle, _DEGREE)
 
     def derivative(self, t: ArrayLike, order: int) -> FloatArray:
         """Derivative of position of some order at times `t` [s], shape (..., 3) [m/s^order].
@@ -79,7 +81,8 @@ class SampledArc:
                 f"the track covers {self.start:.3f} to {self.stop:.3f} s, asked for "
                 f"{t.min():.3f} to {t.max():.3f} s"
             )
-        return np.asarray(self._spline(t, order))
+        found = np.asarray(self._spline(t, order))
+        return found if order else found + self._middle
 
     def position(self, t: ArrayLike) -> FloatArray:
         """Position (..., 3) [m] at times `t` [s]."""

@@ -149,6 +149,73 @@ def _beam_sine(
 
 
 @dataclass(frozen=True)
+class PixelGrid:
+    """Where the pixels of an amplitude image of an aperture lie.
+
+    Parameters
+    ----------
+    first_time, row_time : float
+        Time of zero Doppler of row 0, from the middle of the aperture, and between rows [s].
+    near_range, spacing : float
+        Closest range of column 0, and between columns [m].
+    velocity : float
+        Of azimuth compression [m/s].
+    line : StraightLine
+    ground : Ground
+    side : {1, -1}
+    """
+
+    first_time: float
+    row_time: float
+    near_range: float
+    spacing: float
+    velocity: float
+    line: StraightLine
+    ground: Ground
+    side: int
+
+    def seen(self, row: ArrayLike, column: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Slant range and distance ahead [m] of pixels, fractional, as measured."""
+        tau = self.first_time + np.asarray(row) * self.row_time
+        closest = self.near_range + np.asarray(column) * self.spacing
+        way = self.velocity * tau
+        return np.hypot(closest, way), np.asarray(self.velocity * way / self.line.speed)
+
+    def pixel(self, rho: ArrayLike, ahead: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Row and column, fractional: the inverse of `seen`."""
+        way = np.asarray(ahead) * self.line.speed / self.velocity
+        closest = np.sqrt(np.asarray(rho) ** 2 - way**2)
+        row = (way / self.velocity - self.first_time) / self.row_time
+        return np.asarray(row), np.asarray((closest - self.near_range) / self.spacing)
+
+    def predicted(self, p: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Slant range and distance ahead [m] at which the estimate expects points (..., 3) [m]."""
+        away = np.asarray(p, np.float64) - self.line.r
+        return np.linalg.norm(away, axis=-1), away @ self.line.along
+
+    def places(
+        self,
+        row: ArrayLike,
+        column: ArrayLike,
+        terrain: Height,
+        offset: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> FloatArray:
+        """Points (..., 3) [m] of a terrain that the estimate puts at pixels.
+
+        Parameters
+        ----------
+        row, column : array_like, shape (...)
+        terrain : callable
+            Height [m] at latitudes and longitudes [rad].
+        offset : array_like, shape (3,)
+            Correction of the line's place [m].
+        """
+        rho, ahead = self.seen(row, column)
+        r = self.line.r + np.asarray(offset, np.float64)
+        return seen_on_terrain(self.ground, r, self.line.v, rho, ahead / rho, terrain, self.side)
+
+
+@dataclass(frozen=True)
 class ApertureImage:
     """An image, and where its pixels lie.
 
@@ -178,53 +245,22 @@ class ApertureImage:
         fine = fft.ifft(padded, axis=1, overwrite_x=True, workers=-1)
         return detected(fine * np.float32(RANGE_OVERSAMPLING), (AZIMUTH_LOOKS, 1))
 
-    def seen(self, row: ArrayLike, column: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Slant range and distance ahead [m] of pixels of `amplitude`, fractional, as measured."""
+    @property
+    def grid(self) -> PixelGrid:
+        """Where the pixels of `amplitude` lie."""
         image = self.image
-        line = image.rows.start + AZIMUTH_LOOKS * np.asarray(row) + (AZIMUTH_LOOKS - 1) / 2
-        tau = image.t[0] + line / image.radar.prf
-        spacing = image.slant_range[1] - image.slant_range[0]
-        start = image.slant_range[image.columns.start]
-        closest = start + np.asarray(column) * (spacing / RANGE_OVERSAMPLING)
-        way = image.velocity * tau
-        return np.hypot(closest, way), np.asarray(image.velocity * way / self.line.speed)
-
-    def pixel(self, rho: ArrayLike, ahead: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Row and column of `amplitude`, fractional: the inverse of `seen`."""
-        image = self.image
-        way = np.asarray(ahead) * self.line.speed / image.velocity
-        line = (way / image.velocity - image.t[0]) * image.radar.prf
-        closest = np.sqrt(np.asarray(rho) ** 2 - way**2)
-        spacing = image.slant_range[1] - image.slant_range[0]
-        start = image.slant_range[image.columns.start]
-        row = (line - image.rows.start - (AZIMUTH_LOOKS - 1) / 2) / AZIMUTH_LOOKS
-        return row, (closest - start) * (RANGE_OVERSAMPLING / spacing)
-
-    def predicted(self, p: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Slant range and distance ahead [m] at which the estimate expects points (..., 3) [m]."""
-        away = np.asarray(p, np.float64) - self.line.r
-        return np.linalg.norm(away, axis=-1), away @ self.line.along
-
-    def places(
-        self,
-        row: ArrayLike,
-        column: ArrayLike,
-        terrain: Height,
-        offset: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> FloatArray:
-        """Points (..., 3) [m] of a terrain that the estimate puts at pixels of `amplitude`.
-
-        Parameters
-        ----------
-        row, column : array_like, shape (...)
-        terrain : callable
-            Height [m] at latitudes and longitudes [rad].
-        offset : array_like, shape (3,)
-            Correction of the line's place [m].
-        """
-        rho, ahead = self.seen(row, column)
-        r = self.line.r + np.asarray(offset, np.float64)
-        return seen_on_terrain(self.ground, r, self.line.v, rho, ahead / rho, terrain, self.side)
+        prf = image.radar.prf
+        cells = image.slant_range
+        return PixelGrid(
+            float(image.t[0]) + (image.rows.start + (AZIMUTH_LOOKS - 1) / 2) / prf,
+            AZIMUTH_LOOKS / prf,
+            float(cells[image.columns.start]),
+            float(cells[1] - cells[0]) / RANGE_OVERSAMPLING,
+            image.velocity,
+            self.line,
+            self.ground,
+            self.side,
+        )
 
 
 def aperture_image(echo: ApertureEcho, velocity: float | None = None) -> ApertureImage:

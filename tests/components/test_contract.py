@@ -28,6 +28,9 @@ TYPES = sorted(n for n, e in component_entries().items() if e.value.startswith("
 IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("earlier_pass", "image_album", "image_former", "image_matcher"),
     *("recorded_echo", "recorded_reference", "reference_file", "scene_echo", "terrain"),
+    *("aircraft_radar", "aperture_former", "aperture_matcher"),
+    "earlier_flight",  # in systems/test_aircraft_sar
+    *("recorded_spotlight", "spotlight_matcher", "spotlight_evaluation"),  # in test_aircraft_gotcha
     "lake_catalog",  # and of maps of lakes: in truth/test_lakes
     *(
         "image_moments",
@@ -313,7 +316,7 @@ def _components(file: Path) -> list[str]:
     bases += ("_WholeLakes",)
     # of a filter's own classes
     bases += ("FilterPredict", "FilterCorrect", "FilterEvaluation", "FilterMonitor")
-    bases += ("EnsembleCorrect", "Optics")
+    bases += ("EnsembleCorrect", "Optics", "OnGround")
     abstract = (*bases, "FilterAcquisition", "FilterSensor", "FilterTruth")
     bases += ("LakeCorrect", "MekfPredict", "OrbitEvaluation", "OrbitPredict")
     bases += ("AltimeterCorrect", "ClearanceCorrect", "InertialPredict", "PlaceCorrect")

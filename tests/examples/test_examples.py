@@ -28,6 +28,7 @@ DATA = Path(os.environ.get("TERRAFIX_DATA", EXAMPLES / ".." / ".." / "shared" / 
 SHORT, FEW = "17", 3  # [s], two fixes; members
 SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
     **dict.fromkeys(("leo_lake", "leo_lake_image", "leo_lake_printed"), "1"),
+    "aircraft_sar": "1",
     "leo_lakes_orbit": "3",
     **dict.fromkeys(
         ("geolocation", "geolocation_inertial", "geolocation_pass", "geolocation_printed"), "5"
@@ -35,6 +36,8 @@ SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
     "spacecraft_sar_closed_loop": "4",
     "spacecraft_sar_real_echo": "4",
 }
+
+SHORT_SCRIPTS = {"aircraft_picture": ["--duration", "1"]}  # which form images
 
 
 @pytest.fixture(params=SYSTEMS, ids=lambda p: p.stem)
@@ -156,6 +159,7 @@ def test_what_has_no_name_in_a_file_is_not_written(tmp_path):
 def test_a_script_runs_and_prints_the_number_that_matters(script):
     if "leo_lake.toml" in script.read_text() and not DATA.is_dir():
         pytest.skip(f"no real data: {DATA} is absent (set TERRAFIX_DATA)")
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    words = [sys.executable, script, *SHORT_SCRIPTS.get(script.stem, [])]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert re.search(r"\d", done.stdout)

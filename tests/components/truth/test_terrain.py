@@ -39,3 +39,28 @@ def test_a_terrain_without_a_file_is_a_problem_of_the_check():
     system.add(Terrain(), "terrain")
     with pytest.raises(SystemCheckError, match="'terrain' needs an elevation model\n  set terrain"):
         system.check()
+
+
+def terrain_of(**settings):
+    system = System("ground")
+    system.add(Terrain(source="hills", **settings), name="terrain")
+    simulation = Simulation(system)
+    simulation.run_until("0")
+    return np.array(system.nodes["terrain"].height)
+
+
+def test_heights_that_are_not_the_true_ones_are_off_by_their_error():
+    """3 m rms, to the float32 of heights; and the hills are the same under them."""
+    true, known = terrain_of(), terrain_of(error=3.0)
+    assert (known - true).std() == pytest.approx(3.0, rel=1e-4)
+    assert np.array_equal(true, terrain_of())
+
+
+def test_what_hills_do_not_read_is_refused():
+    terrain = Terrain(source="hills")
+    assert terrain.takes("relief")
+    assert not terrain.takes("mirrored")
+    assert not terrain.takes("error_seed")
+    assert not Terrain(source="flat").takes("relief")
+    with pytest.raises(SystemCheckError, match="set terrain.relief_length"):
+        terrain_of(relief_length=5.0)

@@ -33,6 +33,10 @@ def image_of(aircraft, echo, track, dp=(0, 0, 0), dv=(0, 0, 0), **options):
     return aperture_image(seen, map_drift(seen.domain, seen.speed).velocity)
 
 
+def matched(image, *given):
+    return matched_aperture(image.amplitude(), image.grid, *given)
+
+
 def error(fix, track, image):
     """Measured less true z_r and z_c of the place that a fix is of."""
     away = fix.place - track[1].mean(axis=0)
@@ -48,7 +52,7 @@ def test_a_meter_north_east_and_down_moves_the_image(
 ):
     """-1.00 m along (z_c is how far the antenna is ahead: +1.00), -0.77 and -0.64 m in range."""
     fixes = [
-        matched_aperture(image_of(aircraft, land_echo, track, d), earlier, aircraft.HILLS.at)
+        matched(image_of(aircraft, land_echo, track, d), earlier, aircraft.HILLS.at)
         for d in ((0, 0, 0), dp)
     ]
     assert all(f.accepted for f in fixes)
@@ -68,7 +72,7 @@ def test_an_error_of_velocity_moves_the_image_by_the_whole_of_the_sight(
     in its middle: 0.1 m.
     """
     image = image_of(aircraft, land_echo, track, dv=dv)
-    fix = matched_aperture(image, earlier, aircraft.HILLS.at)
+    fix = matched(image, earlier, aircraft.HILLS.at)
     assert fix.accepted
     expected = -np.asarray(dv) @ (fix.place - image.line.r) / aircraft.SPEED
     assert fix.residual[1] == pytest.approx(expected, abs=0.1)
@@ -82,7 +86,7 @@ def test_errors_are_within_what_the_covariance_claims(aircraft, land_echo, track
     for k in range(5):
         reference = aircraft.reference(aircraft.LAND, track[1].mean(axis=0), 50 + k)
         image = image_of(aircraft, land_echo, track, rng.normal(0, 3, 3), rng.normal(0, 0.1, 3))
-        fix = matched_aperture(image, reference, aircraft.HILLS.at)
+        fix = matched(image, reference, aircraft.HILLS.at)
         assert fix.accepted
         errors.append(error(fix, track, image))
         claims.append(np.diag(fix.covariance))
@@ -98,7 +102,7 @@ def test_a_navigator_that_is_lost_by_two_hundred_meters_is_found(dp, aircraft, l
     """Within 3 m; what is left comes of blaming position for the rest."""
     wide = aircraft.reference(aircraft.LAND, track[1].mean(axis=0), 31, length=520.0)
     image = image_of(aircraft, land_echo, track, dp)
-    fix = matched_aperture(image, wide, aircraft.HILLS.at, WIDEST)
+    fix = matched(image, wide, aircraft.HILLS.at, WIDEST)
     assert fix.accepted
     assert np.abs(error(fix, track, image)).max() < 3.0
 
@@ -108,7 +112,7 @@ def test_a_field_without_features_gives_no_fix(aircraft, field_echo, track):
     image = image_of(aircraft, field_echo, track)
     for seed in range(10):
         reference = aircraft.reference(aircraft.FIELD, track[1].mean(axis=0), seed)
-        fix = matched_aperture(image, reference, aircraft.FIELD.dem.at)
+        fix = matched(image, reference, aircraft.FIELD.dem.at)
         assert not fix.accepted
         assert fix.reason == "correlation has no peak that stands out"
         assert fix.quality < 5.5
@@ -121,7 +125,7 @@ def test_points_alone_are_found_by_amplitude_and_not_by_its_logarithm(aircraft, 
     echo = aircraft.echo_of(bare, own, 5)
     reference = aircraft.reference(bare, track[1].mean(axis=0), 6)
     image = image_of(aircraft, echo, track, (1.0, -2.0, 1.0))
-    fix = matched_aperture(image, reference, bare.dem.at)
+    fix = matched(image, reference, bare.dem.at)
     assert fix.accepted
     assert np.abs(error(fix, track, image)).max() < 0.3
     amplitude = aperture_matching.contrast
@@ -131,7 +135,7 @@ def test_points_alone_are_found_by_amplitude_and_not_by_its_logarithm(aircraft, 
         return amplitude(10 + np.log(np.maximum(image, floor)), *args, **options)
 
     monkeypatch.setattr(aperture_matching, "contrast", logarithm)
-    by_logarithm = matched_aperture(image, reference, bare.dem.at)
+    by_logarithm = matched(image, reference, bare.dem.at)
     assert by_logarithm.quality < 0.5 * fix.quality
 
 
@@ -139,10 +143,10 @@ def test_another_place_is_refused(aircraft, land_echo, track, earlier):
     image = image_of(aircraft, land_echo, track)
     far = track[1].mean(axis=0) + np.array([150.0, 0, 0])
     elsewhere = aircraft.reference(aircraft.LAND, far, 1, length=150.0)
-    fix = matched_aperture(image, elsewhere, aircraft.HILLS.at)
+    fix = matched(image, elsewhere, aircraft.HILLS.at)
     assert fix.reason == "too little of it lies on the reference"
     mirrored = replace(earlier, amplitude=np.ascontiguousarray(earlier.amplitude[:, ::-1]))
-    assert not matched_aperture(image, mirrored, aircraft.HILLS.at).accepted
+    assert not matched(image, mirrored, aircraft.HILLS.at).accepted
 
 
 def test_a_search_holds_three_sigma_and_no_less_than_its_floor():

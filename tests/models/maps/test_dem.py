@@ -6,7 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafix.models.maps.dem import Dem, flat_dem, read_dem, read_hgt, read_jacksboro, write_dem
+from terrafix.models.maps.dem import (
+    Dem,
+    flat_dem,
+    read_dem,
+    read_hgt,
+    read_jacksboro,
+    rolling_dem,
+    write_dem,
+)
 
 DATA = Path(os.environ.get("TERRAFIX_DATA", Path(__file__).parents[4] / "shared" / "data"))
 
@@ -212,3 +220,23 @@ def test_what_is_no_height_of_the_earth_is_refused(tmp_path, height):
     write_dem(Dem(grid, 0.0, 0.0, 0.01, 0.01), tmp_path / "high.npz")
     with pytest.raises(ValueError, match=r"1 of its 9 heights are beyond .* in row 2, column 1"):
         read_dem(tmp_path / "high.npz")
+
+
+def test_rolling_hills_are_as_high_and_as_long_as_asked_for():
+    """Rms 10 m; heights a distance d apart correlate by exp(-(d / L)^2).
+
+    Some 5120^2 / 150^2 = 1,200 independent hills: a correlation is uncertain by 0.03.
+    """
+    dem = rolling_dem(10.0, 150.0, 4)
+    h = dem.height.astype(float)
+    assert h.std() == pytest.approx(10.0, rel=1e-5)
+    assert h.mean() == pytest.approx(0.0, abs=1e-4)
+    for steps in (5, 15, 30):  # of 10 m
+        expected = np.exp(-((10 * steps / 150) ** 2))
+        for axis in (0, 1):
+            found = np.mean(h * np.roll(h, steps, axis)) / 100
+            assert found == pytest.approx(expected, abs=0.1)
+    assert dem.covers(1.0, 2.0)
+    assert not np.array_equal(h, rolling_dem(10.0, 150.0, 5).height)
+    with pytest.raises(ValueError, match="hills are 30 to 2560 m long, not 20 m"):
+        rolling_dem(10.0, 20.0, 4)

@@ -26,6 +26,16 @@ def test_a_point_is_seen_from_a_track_as_from_an_orbit():
     assert pytest.approx(np.hypot(1000.0, 1200.0)) == R
 
 
+def test_far_from_the_origin_a_point_is_seen_at_the_same_time():
+    """6,378 km away, as Earth-fixed places are: to 1e-9 s, where 0.1 um of the track are rounded."""
+    t = np.arange(-2, 2, 0.02)
+    r = np.outer(t, [0.0, 0.0, 70.0])
+    p, away = np.array([-1000.0, 1200.0, 35.0]), np.array([6378137.0, 0.0, 0.0])
+    near, far = (seen_at(SampledArc(t, r + d), p + d, 0.0, 0.03)[0] for d in (0.0 * away, away))
+    assert near == pytest.approx(0.5, abs=1e-12)
+    assert far == pytest.approx(0.5, abs=1e-9)
+
+
 def test_what_is_no_track_is_refused():
     t = np.arange(10.0)
     r = np.zeros((10, 3))

@@ -37,7 +37,7 @@ def test_a_point_is_seen_where_the_estimate_expects_it(name, side, aircraft, poi
         p = place_in_beam(aircraft, r, axis, across, along, side)
         echo = aircraft.point_echo(p[None], own)
         image = aperture_image(aircraft.seen_by(echo, t, r, axis, side=side))
-        row, column = (float(a) for a in image.pixel(*image.predicted(p)))
+        row, column = (float(a) for a in image.grid.pixel(*image.grid.predicted(p)))
         line = image.image.rows.start + AZIMUTH_LOOKS * row + (AZIMUTH_LOOKS - 1) / 2
         cell = image.image.columns.start + column / RANGE_OVERSAMPLING
         peak = points.Peak(image.image.data)
@@ -66,7 +66,7 @@ def test_pixels_are_places_again(aircraft):
     seen = aircraft.seen_by(echo, t, r, axis)
     rows, columns = np.array([3.0, 80.0, 150.0]), np.array([10.0, 333.3, 600.0])
     for velocity in (None, 71.3):
-        image = aperture_image(seen, velocity)
+        image = aperture_image(seen, velocity).grid
         rho, ahead = image.seen(rows, columns)
         np.testing.assert_allclose(image.pixel(rho, ahead), [rows, columns], atol=1e-6)
         p = image.places(rows, columns, aircraft.HILLS.at)
