@@ -69,7 +69,7 @@ REASONS = (
 LEAST_TEXTURE = 2.0
 """Standard deviation of a template, at least, in those of its noise: below, nothing is matched."""
 
-_DOUBTFUL, _CLEAR = 0.9, 0.97
+ALIKE, _CLEAR = 0.9, 0.97
 """Correlations below which a match is looked through for what hides a part of the ground: of a
 search, and of least squares, which a strip of a cloud throws by a tenth of a pixel."""
 _OUTLIER, _LEAST_SEEN, _ALL_SEEN = 4.0, 0.3, 0.98
@@ -300,7 +300,7 @@ def match_frame(
     i, j = divmod(int(surface.argmax()), surface.shape[1])
     found = image[i : i + rows, j : j + columns]
     alike = _correlation(template, found)
-    if alike < _DOUBTFUL:
+    if alike < ALIKE:
         surface, (i, j), alike = _hidden_in_part(template, image, method, surface, (i, j), alike)
     if i in (0, 2 * reach[0]) or j in (0, 2 * reach[1]):
         return FrameMatch(
@@ -361,6 +361,9 @@ def least_squares_shift(
     alike, seen = _correlation(template, middle), None
     if alike < _CLEAR:
         seen = _seen_in_both(template, middle)
+        # what is left is alike where something hides the rest, and not where all is another image
+        if seen is not None and _correlation(template[seen], middle[seen]) < ALIKE:
+            seen = None
         if seen is not None and seen.mean() < _LEAST_SEEN:
             return FrameMatch(np.nan, np.nan, alike, REASONS.index("too much is hidden"))
     T, S, u, v = (
@@ -437,7 +440,7 @@ def _hidden_in_part(
         alike = _correlation(template[both], image[i : i + rows, j : j + columns][both])
         if alike > best[2]:
             best = surface, (i, j), alike
-        if alike >= _DOUBTFUL:
+        if alike >= ALIKE:
             break
     return best
 
