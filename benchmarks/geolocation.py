@@ -31,6 +31,13 @@ ORBITS = ("LEO", "MOL")
 PLACE = ("-25.25 deg", "-54.66 deg")
 """In the overlap of two rows of the satellite."""
 NCC = (("matcher.method", "ncc"), ("georeference.method", "ncc"))
+OTHER_BAND = (
+    ("known_located.georeference_sigma", "0.1 px"),
+    ("known_mapped.mismatch_sigma", "0.1 px"),
+    ("located_predict.mismatch_sigma", "0.1 px"),
+    ("located_predict.mismatch_time", "1000 s"),
+)
+"""What a match of one band to another is off by, the same in all frames."""
 EFFECTS: dict[str, tuple[tuple[str, str], ...]] = {
     "point spread 1 px": (("camera.blur", "1 px"), ("georeference.blur", "1 px")),
     "noise 16 codes": (
@@ -42,6 +49,8 @@ EFFECTS: dict[str, tuple[tuple[str, str], ...]] = {
     "light +24 %, ssd": (("camera.light_rate", "2e-4 1/s"),),
     "light +24 %, ncc": (("camera.light_rate", "2e-4 1/s"), *NCC),
     "10 % hidden": (("camera.hidden", "0.1"),),
+    "30 % hidden": (("camera.hidden", "0.3"),),
+    "30 % hidden, gate": (("camera.hidden", "0.3"), ("corrected_correct.gate", "13.8")),
     "10 % hidden, phase": (("camera.hidden", "0.1"), ("matcher.method", "phase")),
     "turned by 1 deg": (("camera.turn_rate", "1.454e-5 rad/s"),),
     "grown by 1 %": (("camera.stretch_rate", "8.33e-6 1/s"),),
@@ -129,15 +138,19 @@ def printed(members: int) -> None:
         print(f"  matched over its first: {rss.min() / rss[0]:.3f} to {rss.max() / rss[0]:.3f}")
 
 
+def effects(few: int) -> None:
+    """Print what disturbs the images of the corrected system."""
+    for name, settings in EFFECTS.items():
+        print(name)
+        match_errors(fly("geolocation.toml", few, *settings))
+
+
 def corrected(members: int, few: int) -> None:
     """Print the corrected system, its methods, and what disturbs its images."""
     for orbit in ORBITS:
         match_errors(fly("geolocation.toml", members, ("orbit", orbit)))
         for method in ("ncc", "phase"):
             match_errors(fly("geolocation.toml", few, ("orbit", orbit), ("matcher.method", method)))
-    for name, settings in EFFECTS.items():
-        print(name)
-        match_errors(fly("geolocation.toml", few, *settings))
 
 
 def others(files: list[str], few: int) -> None:
@@ -156,6 +169,7 @@ def others(files: list[str], few: int) -> None:
             settings += [(f"{part}.latitude", PLACE[0]), (f"{part}.longitude", PLACE[1])]
         print(f"scene of {Path(file).name}, map of band 4")
         fly(str(path), few, *settings)
+        fly(str(path), few, *settings, *OTHER_BAND)
         path.unlink()
 
 
@@ -178,10 +192,13 @@ def main() -> None:
     parser.add_argument("--few", type=int, default=20)
     parser.add_argument("--other", nargs="*", default=[])
     parser.add_argument(
-        "--only", choices=("printed", "corrected", "pass", "others", "speed"), default=None
+        "--only",
+        choices=("printed", "corrected", "effects", "pass", "others", "speed"),
+        default=None,
     )
     options = parser.parse_args()
-    wanted = [options.only] if options.only else ["speed", "printed", "corrected", "pass", "others"]
+    all_parts = ["speed", "printed", "corrected", "effects", "pass", "others"]
+    wanted = [options.only] if options.only else all_parts
     if "speed" in wanted:
         speed()
     if "printed" in wanted:
@@ -191,6 +208,8 @@ def main() -> None:
         return
     if "corrected" in wanted:
         corrected(options.members, options.few)
+    if "effects" in wanted:
+        effects(options.few)
     if "pass" in wanted:
         for settings in ((), (("camera.cycle", "20 s"), ("camera.stare", "5 s"))):
             fly("geolocation_pass.toml", options.members, *settings)

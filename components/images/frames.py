@@ -39,6 +39,7 @@ from terrafix.models.core.arrays import Single
 from terrafix.models.core.parallel import batches, over
 from terrafix.models.filters.geolocation import FIRST_FRAME
 from terrafix.models.images.frames import (
+    ALIKE,
     METHODS,
     REASONS,
     FrameMatch,
@@ -261,7 +262,12 @@ class _FrameMatcher(_Matching):
                 match = self._sought(_cut(frame, size), self.field[m, top:bottom, left:right], m)
                 self._keep(m, match)
                 row, column = match.row, match.column
-                if self.subpixel and self.again and match.reason == 0:
+                if (
+                    self.subpixel
+                    and self.again
+                    and match.reason == 0
+                    and match.correlation >= ALIKE
+                ):
                     row, column = self._again(m, frame, top + up + row, left + side + column)
                     row, column = row - top - up, column - left - side
                 y[m] = whole[m, 0] - row, whole[m, 1] + column
@@ -350,7 +356,8 @@ class _Georeference(_Matching):
             for m in rows[part]:
                 y[m], _ = self._found(m, target[m], int(gate[m]))
                 for _ in range(_LOOKS if self.subpixel and self.again else 0):
-                    if self._reasons[m] != 0:
+                    # of images that are less alike parabolas tell more
+                    if self._reasons[m] != 0 or self._alike[m] < ALIKE:
                         break
                     y[m], moved = self._found(m, y[m])
                     if moved < _STILL:

@@ -69,7 +69,7 @@ REASONS = (
 LEAST_TEXTURE = 2.0
 """Standard deviation of a template, at least, in those of its noise: below, nothing is matched."""
 
-_DOUBTFUL, _CLEAR = 0.9, 0.97
+ALIKE, _CLEAR = 0.9, 0.97
 """Correlations below which a match is looked through for what hides a part of the ground: of a
 search, and of least squares, which a strip of a cloud throws by a tenth of a pixel."""
 _OUTLIER, _LEAST_SEEN, _ALL_SEEN = 4.0, 0.3, 0.98
@@ -300,7 +300,7 @@ def match_frame(
     i, j = divmod(int(surface.argmax()), surface.shape[1])
     found = image[i : i + rows, j : j + columns]
     alike = _correlation(template, found)
-    if alike < _DOUBTFUL:
+    if alike < ALIKE:
         surface, (i, j), alike = _hidden_in_part(template, image, method, surface, (i, j), alike)
     if i in (0, 2 * reach[0]) or j in (0, 2 * reach[1]):
         return FrameMatch(
@@ -361,16 +361,22 @@ def least_squares_shift(
     alike, seen = _correlation(template, middle), None
     if alike < _CLEAR:
         seen = _seen_in_both(template, middle)
+        # what is left is alike where something hides the rest, and not where all is another image
+        if seen is not None and _correlation(template[seen], middle[seen]) < ALIKE:
+            seen = None
         if seen is not None and seen.mean() < _LEAST_SEEN:
             return FrameMatch(np.nan, np.nan, alike, REASONS.index("too much is hidden"))
-    T, S, u, v = (x.ravel() if seen is None else x[seen] for x in (template, middle, down, right))
+    T, S, u, v = (
+        np.asarray(x.ravel() if seen is None else x[seen], np.float32)
+        for x in (template, middle, down, right)
+    )
     if seen is not None:
         alike = _correlation(T, S)
         noise *= float(np.sqrt(2.0))  # pixels are others each time, and the image's noise is, too
     if not alike >= least:
         return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
     if light:
-        T = (T - T.mean()) * (S.std() / T.std()) + S.mean()
+        T = np.asarray((T - T.mean()) * (S.std() / T.std()) + S.mean(), np.float32)
         noise = noise * float(S.std() / template.std())
     off = T - S
     a, b, c = float(u @ u), float(u @ v), float(v @ v)
@@ -381,7 +387,8 @@ def least_squares_shift(
     row, column = (c * down_off - b * right_off) / det, (a * right_off - b * down_off) / det
     if max(abs(row), abs(column)) > 1.0:
         return FrameMatch(np.nan, np.nan, alike, REASONS.index("the images are not alike"))
-    if seen is not None and not _parts_agree(template, seen, (T, S, u, v), (row, column)):
+    pixels = (T, S, u, v)
+    if seen is not None and not _parts_agree(template, seen, pixels, (row, column), noise):
         return FrameMatch(np.nan, np.nan, alike, REASONS.index("its parts do not agree"))
     sigmas = (noise * float(np.sqrt(x / det)) for x in (c, a))
     return FrameMatch(row, column, alike, 0, *sigmas)
@@ -392,6 +399,7 @@ def _parts_agree(
     seen: NDArray[np.bool_],
     pixels: tuple[Single, ...],
     shift: tuple[float, float],
+    noise: float,
 ) -> bool:
     """Whether quarters of a template, shifted each by itself, leave as much as all together.
 
@@ -408,7 +416,7 @@ def _parts_agree(
         A, b = g @ g.T, g @ off
         if float(np.linalg.det(A)) > _SMOOTH * float(A[0, 0] * A[1, 1]):
             gain += float(b @ np.linalg.solve(A, b))
-    return gain < _DISAGREE * float(np.mean(left * left))
+    return gain < _DISAGREE * max(float(np.mean(left * left)), noise * noise)
 
 
 def _hidden_in_part(
@@ -422,8 +430,8 @@ def _hidden_in_part(
     """Score, peak and correlation of a template without what hides a part of it, if that is so."""
     rows, columns = template.shape
     best = surface, at, alike
-    for search in (lambda: at, lambda: _of_sure_pixels(template, image)):
-        i, j = search()
+    for look in range(2):
+        i, j = at if look == 0 else _of_sure_pixels(template, image)
         both = _seen_in_both(template, image[i : i + rows, j : j + columns])
         if both is None or both.mean() < _LEAST_SEEN:
             continue
@@ -432,7 +440,7 @@ def _hidden_in_part(
         alike = _correlation(template[both], image[i : i + rows, j : j + columns][both])
         if alike > best[2]:
             best = surface, (i, j), alike
-        if alike >= _DOUBTFUL:
+        if alike >= ALIKE:
             break
     return best
 

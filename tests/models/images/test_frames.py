@@ -12,8 +12,10 @@ from terrafix.models.images.frames import (
     frame_to_scene,
     hidden_square,
     inside,
+    least_squares_shift,
     match_frame,
     sampled,
+    shifted,
     textured_scene,
 )
 
@@ -183,3 +185,61 @@ def test_bad_input_is_refused(scene):
         ValueError, match="a template of 64 x 64 pixels cannot be sought in an imag"
     ):
         match_frame(scene[:64, :64], scene[:48, :48])
+
+
+def pair(scene, shift, n=40, noise=0.0, seed=0):
+    """A template and the window of two pixels more that it lies in, but for a shift (down, right).
+
+    Both sampled twice as coarsely as the scene is, behind a point spread of one pixel of theirs.
+    """
+    rng = np.random.default_rng(seed)
+    smooth, view = blurred(scene, 2.0), np.eye(2)[None] / 100.0
+    images = []
+    for target, size in (((shift[0], -shift[1]), n), ((0.0, 0.0), n + 4)):
+        at = frame_to_scene(np.array([target]), view, PLACE, NORTH_UP, size)[0]
+        images.append(coded(sampled(smooth, at, size), noise, 0, rng))
+    return images
+
+
+def test_least_squares_have_no_error_by_the_part_of_a_pixel(scene):
+    """Shifts to 0.3 px, found to the second order: a second look at what is left is exact."""
+    for shift in ((0.3, -0.2), (0.05, 0.0), (-0.25, 0.25)):
+        found = least_squares_shift(*pair(scene, shift))
+        assert np.hypot(found.row - shift[0], found.column - shift[1]) < 0.03
+    same = least_squares_shift(*pair(scene, (0.0, 0.0)))
+    assert (same.row, same.column) == (0.0, 0.0)
+
+
+def test_least_squares_tell_the_noise_of_a_template(scene):
+    """200 draws of noise in the template alone: spread of the shift as told, to 10 percent."""
+    template, image = pair(scene, (0.0, 0.0))
+    rng = np.random.default_rng(4)
+    found = [
+        least_squares_shift(coded(template, 4.0, 0, rng), image, noise=4.0) for _ in range(200)
+    ]
+    for axis in ("row", "column"):
+        spread = np.std([getattr(f, axis) for f in found])
+        assert spread == pytest.approx(
+            np.mean([getattr(f, f"sigma_{axis}") for f in found]), rel=0.15
+        )
+
+
+def test_a_shift_by_a_windowed_sinc_keeps_what_is_fine(scene):
+    """There and back by 0.37 px: a wave of five pixels to 1 percent; whole shifts are exact."""
+    wave = np.sin(2 * np.pi * np.arange(64) / 5)[None].repeat(64, 0).astype(np.float32)
+    moved = shifted(wave, 0.0, 0.37)
+    truth = np.sin(2 * np.pi * (np.arange(64) - 0.37) / 5)
+    np.testing.assert_allclose(moved[32, 8:-8], truth[8:-8], atol=0.01)
+    np.testing.assert_allclose(shifted(wave, 2.0, -3.0)[8:-8, 8:-8], wave[6:-10, 11:-5], atol=1e-6)
+
+
+def test_two_clouds_are_left_out_and_what_they_hold_together_is_refused(scene):
+    """A third of both is hidden, not the same: found. Nine tenths of one: refused."""
+    template, image = (x.copy() for x in pair(scene, (0.1, -0.1)))
+    template[:23, :23], image[-25:, -25:] = 250.0, 250.0
+    found = least_squares_shift(template, image, noise=1.0)
+    assert found.reason == 0
+    assert np.hypot(found.row - 0.1, found.column + 0.1) < 0.03
+    hidden = template.copy()
+    hidden[:36] = 250.0
+    assert least_squares_shift(hidden, image).reason != 0
