@@ -62,5 +62,5 @@ def test_what_hills_do_not_read_is_refused():
     assert not terrain.takes("mirrored")
     assert not terrain.takes("error_seed")
     assert not Terrain(source="flat").takes("relief")
-    with pytest.raises(SystemCheckError, match="set terrain.relief_length"):
+    with pytest.raises(SystemCheckError, match=r"set terrain\.relief_length"):
         terrain_of(relief_length=5.0)
