@@ -146,6 +146,7 @@ class ApertureFormer(OnGround):
             ground,
             height,
             side=side,
+            terrain=dem.at,
             compensate=self.compensated,
         )
 

@@ -28,7 +28,7 @@ DATA = Path(os.environ.get("TERRAFIX_DATA", EXAMPLES / ".." / ".." / "shared" / 
 SHORT, FEW = "17", 3  # [s], two fixes; members
 SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
     **dict.fromkeys(("leo_lake", "leo_lake_image", "leo_lake_printed"), "1"),
-    "aircraft_sar": "1",
+    "aircraft_sar": "0.4",
     "leo_lakes_orbit": "3",
     **dict.fromkeys(
         ("geolocation", "geolocation_inertial", "geolocation_pass", "geolocation_printed"), "5"

@@ -27,7 +27,7 @@ def test_a_point_is_seen_from_a_track_as_from_an_orbit():
 
 
 def test_far_from_the_origin_a_point_is_seen_at_the_same_time():
-    """6,378 km away, as places on Earth are: to 1e-9 s, where 0.1 um of the track are rounded."""
+    """6,378 km away, as Earth-fixed places are: to 1e-9 s, 0.1 um of the track."""
     t = np.arange(-2, 2, 0.02)
     r = np.outer(t, [0.0, 0.0, 70.0])
     p, away = np.array([-1000.0, 1200.0, 35.0]), np.array([6378137.0, 0.0, 0.0])

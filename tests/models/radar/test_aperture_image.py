@@ -59,6 +59,26 @@ def test_without_compensation_a_turn_blurs(aircraft):
     assert heights[1] < 0.5 * heights[0]
 
 
+def test_in_a_turn_the_height_of_a_place_focuses_it(aircraft, points):
+    """7 m higher, at 1562 m, a place lies 5.8 m farther out, and 3.66 m/s^2 pull that much more.
+
+    R / (2 V) a 5.8 / 1562 = 0.15 m/s: by what another height than its own misleads map drift.
+    """
+    t, r, axis = aircraft.track(acceleration=(0.0, 3.66, 0.0))
+    out = np.sqrt(aircraft.RANGE**2 - (aircraft.HEIGHT - 7.0) ** 2)
+    p = np.array([0.0, r[300, 1] + out, -7.0])
+    echo = aircraft.point_echo(p[None], aircraft.aperture(t, r, axis))
+    best = []
+    for terrain in (None, lambda latitude, _: 7.0 + 0 * latitude):
+        seen = aircraft.seen_by(echo, t, r, axis, terrain=terrain)
+        v = aircraft.SPEED + np.array([-0.3, 0.0, 0.3])
+        heights = [points.Peak(aperture_image(seen, x).image.data).height for x in v]
+        a, b, _ = np.polyfit(v - aircraft.SPEED, heights, 2)
+        best.append(-b / (2 * a))
+    assert best[1] == pytest.approx(0.0, abs=0.02)
+    assert abs(best[0]) == pytest.approx(0.15, abs=0.03)
+
+
 def test_pixels_are_places_again(aircraft):
     """`pixel` undoes `seen`, with another velocity, too; `predicted` undoes `places`."""
     t, r, axis = aircraft.track(crab=0.05)
