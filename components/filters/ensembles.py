@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,6 +17,27 @@ from terrafix.cosim.declare.ports import Capabilities
 from terrafix.models.core.model import Model
 from terrafix.models.filters.ensembles import ANSWER, EnsembleObservation, Stage, staged_model
 from terrafix.models.filters.measurement import TIME
+
+
+class _Same:
+    """A thing that equals itself alone, to be remembered by."""
+
+    def __init__(self, thing: Any) -> None:
+        self.thing = thing
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.thing is other.thing
+
+    def __hash__(self) -> int:
+        return id(self.thing)
+
+
+@lru_cache(maxsize=32)
+def _staged(
+    name: str, state: _Same, observation: _Same, update: str, weights: str
+) -> tuple[Model, list[Stage]]:
+    """A model and its stages: those of a second filter of a kind, or of a second run, at once."""
+    return staged_model(name, state.thing, observation.thing, update, weights=weights, chained=True)
 
 
 class EnsembleCorrect(FilterCorrect):
@@ -39,13 +61,12 @@ class EnsembleCorrect(FilterCorrect):
 
     def build_model(self) -> Model:
         """Build the model for the chosen update and weights, whose predictions are inputs."""
-        self._stages = staged_model(
+        self._stages = _staged(
             self.model_name,
-            self.error_state,
-            self.chosen_observation(),
+            _Same(self.error_state),
+            _Same(self.chosen_observation()),
             self.update,
-            weights=self.weights,
-            chained=True,
+            self.weights,
         )
         return self._stages[0]
 

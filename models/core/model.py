@@ -261,8 +261,15 @@ class Model:
 
         Inputs, states, parameters, noise, step and time, in this order, to outputs and states.
         """
+        return self._step if name is None else self._step_called(name)
+
+    @cached_property
+    def _step(self) -> Any:
+        return self._step_called(f"{self.name}_step")
+
+    def _step_called(self, name: str) -> Any:
         outputs = {k.replace("next:", "next_"): e for k, e in self.step_outputs.items()}
-        return sharing_reciprocals(self._function(name or f"{self.name}_step", outputs))
+        return sharing_reciprocals(self._function(name, outputs))
 
     def rate_function(self, name: str | None = None) -> Any:
         """Build outputs and derivatives of continuous states as a function.
