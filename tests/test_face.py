@@ -40,7 +40,7 @@ def test_the_face_is_what_it_was():
 
 
 FILTERS = [
-    *("ALARMS", "Block", "EnsembleCorrect", "EnsembleObservation", "ErrorState"),
+    *("ALARMS", "Block", "Carried", "EnsembleCorrect", "EnsembleObservation", "ErrorState"),
     *("FilterAcquisition", "FilterCorrect", "FilterEvaluation", "FilterMonitor", "FilterPredict"),
     *("FilterSensor", "FilterTruth", "Observation", "Process", "clone", "considered"),
     *("ensemble_observation", "rotation", "vector"),

@@ -27,7 +27,8 @@ SCRIPTS = sorted(EXAMPLES.glob("*.py"))
 DATA = Path(os.environ.get("TERRAFIX_DATA", EXAMPLES / ".." / ".." / "shared" / "data"))
 SHORT, FEW = "17", 3  # [s], two fixes; members
 SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
-    **dict.fromkeys(("leo_lake", "leo_lake_image", "leo_lake_printed"), "1"),
+    **dict.fromkeys(("leo_lake", "leo_lake_image", "leo_lake_printed", "leo_lake_shore"), "1"),
+    "aircraft_gotcha": "1",
     "aircraft_sar": "0.4",
     "leo_lakes_orbit": "3",
     **dict.fromkeys(

@@ -89,6 +89,7 @@ def test_innovations_are_white(flight):
     assert (np.abs(correlation) < 0.1).all()
 
 
+@pytest.mark.campaign
 def test_the_real_earth_asks_for_nothing_else(flight):
     """WGS-84 by one switch: the same draws, and sigmas within 1 %."""
     real = Flown(RADAR, ("earth", "wgs84"))
@@ -97,6 +98,7 @@ def test_the_real_earth_asks_for_nothing_else(flight):
     assert 17.2 <= real["nees"].mean() <= 18.9
 
 
+@pytest.mark.campaign
 def test_an_altimeter_may_have_a_rate_of_its_own(flight):
     """Ten times as often, between fixes of the radar: down is known better, and as well as said."""
     parts = ("altimeter", "correct_height", "correct_shift")
@@ -107,6 +109,7 @@ def test_an_altimeter_may_have_a_rate_of_its_own(flight):
     assert 17.2 <= often["nees"].mean() <= 18.9
 
 
+@pytest.mark.campaign
 def test_looking_to_both_sides_frees_east_and_down_of_the_altimeter():
     """3 sigma 0.41 m east and 1.45 m down (NOTES B5), where one side leaves 2.5 and 2.6 m."""
     flown = Flown(RADAR, ("radar.looks", "in-turn"))
@@ -125,6 +128,7 @@ def test_map_drift_is_a_third_row():
     assert low < np.nanmean(flown["nis"]) < high
 
 
+@pytest.mark.campaign
 def test_map_drift_in_a_turn_with_gusts():
     """Axes of an aperture's end, and a mean acceleration: 3 deg/s and 1.5 m/s of turbulence."""
     settings = [("radar.rows", "shift-and-drift"), ("flight.turbulence", "dryden"), IN_A_TURN]
@@ -231,6 +235,7 @@ def nees_without_range_bias(flown):
     return np.einsum("ki,ki->k", error, np.linalg.solve(P, error[..., None])[..., 0]).mean()
 
 
+@pytest.mark.campaign
 def test_an_error_of_the_map_is_a_bias_of_its_length_and_no_white_noise():
     """Common to neighboring apertures: found out as white noise, not as a bias of 3 s."""
     white = Flown(

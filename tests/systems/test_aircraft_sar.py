@@ -85,6 +85,7 @@ def test_map_drift_reads_what_the_track_is_off_by(flight):
     assert np.abs(line + drift - 70.0).max() < 0.2
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("settings", [[("earth", "wgs84")], [("looks", "in-turn")]])
 def test_the_real_earth_and_both_sides(settings):
     data = flown(*settings)
@@ -103,6 +104,7 @@ def test_a_member_alone_is_the_member_of_the_ensemble():
     assert not np.array_equal(fix[0], fix[1])
 
 
+@pytest.mark.campaign
 def test_a_run_taken_up_again_goes_on_to_the_same_bytes():
     """From within an aperture: what was flown of it is part of the state."""
     whole = flown(seconds=2)

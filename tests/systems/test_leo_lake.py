@@ -87,6 +87,7 @@ def considering(outline, *settings, **sigmas):
     return read(outline, *TEN_HZ, *settings, *told, file=file)
 
 
+@pytest.mark.campaign
 def test_an_attitude_that_is_off_is_honest_once_it_is_considered(outline):
     """0.02 deg at 550 km are 190 m per axis: ten sigma of the plain filter, one of the other."""
     off = ("camera.attitude_sigma", "0.02 deg")
@@ -98,6 +99,7 @@ def test_an_attitude_that_is_off_is_honest_once_it_is_considered(outline):
     assert 100.0 < np.median(final(honest)) < 600.0
 
 
+@pytest.mark.campaign
 def test_a_catalog_that_is_off_is_honest_once_its_vertices_are_considered(outline):
     """Of 100 m per vertex and axis, drawn once a member; a scale that is considered is no help."""
     off = ("camera.catalog_sigma", "100 m")
@@ -275,6 +277,7 @@ def test_islands_are_left_out_by_both_and_said_or_counted_by_both(outline, caplo
             assert 200.0 < np.median(final(result)) < 2000.0
 
 
+@pytest.mark.campaign
 def test_an_image_shows_islands_as_the_filter_takes_them(outline):
     """Moments measured in images are those of the contour with its islands, within their noise."""
     period = [

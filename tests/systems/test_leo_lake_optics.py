@@ -133,6 +133,7 @@ def test_a_filter_that_reads_the_attitude_is_consistent(outline):
     assert low < nees(result) < high
 
 
+@pytest.mark.campaign
 def test_a_star_tracker_that_is_off_is_honest_once_it_is_considered(outline):
     """0.02 deg at 550 km are 190 m per axis."""
     low, high = BOUNDS

@@ -47,6 +47,7 @@ def test_the_two_outlines_of_mark_twain_lake_differ_by_what_was_measured(real):
     assert apart["rms distance [m]"] > 300.0  # arms that are there in one alone
 
 
+@pytest.mark.campaign
 def test_a_catalog_that_is_not_the_water_is_kilometers_off_unless_it_is_considered(real):
     """Its islands and the Earth's height of 150 m included; the same catalog is the control."""
     own, nees = flown(real, "water")

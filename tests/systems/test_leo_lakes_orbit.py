@@ -24,6 +24,7 @@ def flown():
     return tf.simulate(system, members=MEMBERS, duration="5480 s").dataset
 
 
+@pytest.mark.campaign
 def test_it_is_consistent_before_and_after_the_sea(flown):
     """NEES of the position, of three, in the 99.9 % interval of the members; none is lost."""
     nees = flown["evaluation.nees"].values
