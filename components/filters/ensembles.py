@@ -133,8 +133,10 @@ class EnsembleCorrect(FilterCorrect):
             found = stage.points(*arrays)
             values = {
                 b.name: np.reshape(v, (len(who) * n_points, b.value_size))
-                for b, v in zip(self.error_state, found, strict=True)
+                for b, v in zip(self.error_state, found, strict=False)
             }
+            for number, error in zip(stage.held, found[len(values) :], strict=True):
+                self._answers[f"{ANSWER}.e{number}"][who] = error
             self._answer(stage, who, values, self._given(who, n_points))
 
     def _given(self, who: NDArray[np.int64], n_points: int) -> dict[str, Any]:

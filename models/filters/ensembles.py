@@ -146,7 +146,7 @@ def _scalar(function: Any) -> Any:
         return function
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Question:
     """An error at which a rule asks for a prediction, the symbol of the answer, and of H's."""
 
@@ -154,12 +154,32 @@ class _Question:
     y: Any
     H: Any
 
+    @property
+    def symbols(self) -> Any:
+        """All that it is answered with."""
+        return ca.veccat(self.y, self.H)
+
+
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """An error that a rule went on with: its symbol, and how it was found."""
+
+    symbol: Any
+    error: Any
+
+    @property
+    def symbols(self) -> Any:
+        """All that stands for it."""
+        return self.symbol
+
 
 @dataclass(frozen=True)
 class _Traced(Observation):
     """An observation that answers with symbols, and keeps what it was asked."""
 
     asked: list[_Question] = field(default_factory=list)
+    held: list[_Held] = field(default_factory=list)
+    trace: list[_Question | _Held] = field(default_factory=list)  # both, in their order
     wanted: set[int] = field(default_factory=set)  # those whose derivative is asked for
     prior: dict[str, Any] = field(default_factory=dict)
 
@@ -178,7 +198,14 @@ class _Traced(Observation):
             k = len(self.asked)
             y, H = ca.SX.sym(f"y{k}", self.size), ca.SX.sym(f"H{k}", self.size, state.size)
             self.asked.append(_Question(error, y, H))
+            self.trace.append(self.asked[-1])
             return k
+
+        def hold(error: Any) -> Any:
+            symbol = ca.SX.sym(f"e{len(self.held)}", state.size)
+            self.held.append(_Held(symbol, ca.densify(ca.SX(error))))
+            self.trace.append(self.held[-1])
+            return symbol
 
         def derivative(error: Any) -> Any:
             k = place(error)
@@ -193,16 +220,34 @@ class _Traced(Observation):
             lambda _: message["R"],
             message["present"],
             self.angular,
+            hold,
         )
 
     def answers(self) -> dict[str, Any]:
         """Symbols of the answers by name."""
         found = {f"{ANSWER}.y{k}": q.y for k, q in enumerate(self.asked)}
-        return found | {f"{ANSWER}.H{k}": self.asked[k].H for k in sorted(self.wanted)}
+        found |= {f"{ANSWER}.H{k}": self.asked[k].H for k in sorted(self.wanted)}
+        return found | {f"{ANSWER}.e{k}": h.symbol for k, h in enumerate(self.held)}
+
+    def rounds(self) -> list[list[_Question | _Held]]:
+        """What can be found one round after the other: errors, and what is asked at them."""
+        level: list[int] = []
+        for thing in self.trace:
+            own = 0
+            for other, at in zip(self.trace, level, strict=False):
+                if ca.depends_on(thing.error, other.symbols):
+                    # an answer is there a round later
+                    own = max(own, at + isinstance(other, _Question))
+            level.append(own)
+        return [
+            [thing for thing, at in zip(self.trace, level, strict=True) if at == depth]
+            for depth in range(1 + max(level))
+        ]
 
 
 ANSWER = "answer"
-"""Head of the names of a model's inputs that are answers: ``answer.y0``, ``answer.H0``."""
+"""Head of the names of a model's inputs that are answers: ``answer.y0``, ``answer.H0``; and errors
+that were found from them, ``answer.e0``."""
 
 
 @dataclass(frozen=True)
@@ -212,18 +257,22 @@ class Stage:
     Attributes
     ----------
     points : callable
-        Values of every block at the points, (..., p, size) each, from arrays of the arguments.
+        Values of every block at the points, (..., p, size) each, and errors (..., n) that are held,
+        from arrays of the arguments.
     arguments : dict of str to tuple of int
         Shapes of what it takes of the model, by name: inputs, parameters, ``state:NAME``.
     numbers : tuple of int
         Of the questions: the answers go to ``answer.yK`` and ``answer.HK``.
+    held : tuple of int
+        Of the errors, which go to ``answer.eK``.
     derived : bool
-        Whether any of them asks for a derivative.
+        Whether any of the questions asks for a derivative.
     """
 
     points: Callable[..., Any]
     arguments: dict[str, tuple[int, ...]]
     numbers: tuple[int, ...]
+    held: tuple[int, ...]
     derived: bool
 
 
@@ -243,29 +292,19 @@ def staged_model(
         valid_at=observation.valid_at,
     )
     model = correct_model(name, state, traced, update, **options)
-    level: dict[int, int] = {}
-    for k, question in enumerate(traced.asked):
-        before = [
-            level[i]
-            for i in range(k)
-            if ca.depends_on(question.error, ca.veccat(traced.asked[i].y, traced.asked[i].H))
-        ]
-        level[k] = 1 + max(before, default=-1)
-    stages = []
-    for depth in range(1 + max(level.values())):
-        numbers = tuple(k for k in level if level[k] == depth)
-        stages.append(_stage(state, traced, model, numbers))
-    return model, stages
+    return model, [_stage(state, traced, model, found) for found in traced.rounds()]
 
 
 def _stage(
-    state: ErrorState,
-    traced: _Traced,
-    model: Model,
-    numbers: tuple[int, ...],
+    state: ErrorState, traced: _Traced, model: Model, found: list[_Question | _Held]
 ) -> Stage:
+    numbers = tuple(k for k, question in enumerate(traced.asked) if question in found)
+    held = tuple(k for k, error in enumerate(traced.held) if error in found)
     at = [state.retract(traced.prior, traced.asked[k].error) for k in numbers]
     values = [ca.horzcat(*(ca.SX(point[b.name]) for point in at)).T for b in state]
+    for k in reversed(held):  # what is found now is asked at in the same round
+        values = ca.substitute(values, [traced.held[k].symbol], [traced.held[k].error])
+    values += [traced.held[k].error for k in held]
     if model.states:  # what a model puts out is of its states at the end of the step
         ends = [ca.SX(model.next.get(key, symbol)) for key, symbol in model.states.items()]
         values = ca.substitute(values, list(model.states.values()), ends)
@@ -282,4 +321,4 @@ def _stage(
 
     shapes = {n: (s.shape[:1] if s.shape[1] == 1 else s.shape) for n, s in used.items()}
     points = over_members(expressions, *shapes.values())
-    return Stage(points, shapes, numbers, bool(traced.wanted & set(numbers)))
+    return Stage(points, shapes, numbers, held, bool(traced.wanted & set(numbers)))

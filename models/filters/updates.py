@@ -67,6 +67,9 @@ class Measurement:
         1 where an element was measured, else 0.
     angles : tuple of int
         Elements that are angles [rad]: their differences are taken within half a turn.
+    held : callable
+        What a rule goes on with of an error that it found: the same; a symbol for it where
+        predictions are questions, so that one that follows does not repeat how it was found.
     """
 
     y: Any
@@ -75,6 +78,7 @@ class Measurement:
     noise: Callable[[Any], Any]
     present: Any
     angles: tuple[int, ...] = ()
+    held: Callable[[Any], Any] = lambda error: error
 
     def residual(self, error: Any) -> Any:
         """Measured minus predicted, (m, 1); zero where absent."""
@@ -206,11 +210,11 @@ def iterated_update(
     Parameters as there.
     """
     first = ekf_update(P, measurement, beta, considered)
-    error, positive = first.correction, first.positive
+    error, positive = measurement.held(first.correction), first.positive
     for _ in range(_ITERATIONS - 1):
         H, K, solvable, R = _linearized(P, measurement, beta, error, considered)
         innovation = measurement.residual(error) + ca.mtimes(H, error)
-        error = ca.mtimes(K, innovation)
+        error = measurement.held(ca.mtimes(K, innovation))
         positive = ca.logic_and(positive, solvable)
     H, K, solvable, R = _linearized(P, measurement, beta, error, considered)
     return Update(
