@@ -60,7 +60,7 @@ class _WholeLakes(Component):
         )
 
     def whole(self) -> NDArray[np.bool_]:
-        """Members that are told of a whole lake now."""
+        """Members that are told of a whole lake now; what was told at best is kept."""
         look = self.look
         better = look.fresh & (look.share > self._best[:, 0])
         told = np.stack([look.share, look.lake, look.t], axis=1)

@@ -39,6 +39,7 @@ View_co = TypeVar("View_co", covariant=True)
 MOST_WRITTEN = 9  # numbers of an array
 LONGEST_WRITTEN = 60  # characters of a value
 MOST_FIELDS = 3  # of a bundle, in a repr
+_OF_MESSAGES = ("t", "value", "valid", "count", "fresh", "sequence")  # what every message has
 
 
 class Declaration:
@@ -128,6 +129,11 @@ class Port(Declaration, Generic[View_co]):
                 if not name.isidentifier():
                     raise ConfigurationError(
                         f"'{name}' cannot name a field: use letters, digits and underscores"
+                    )
+                if self.kind == "message" and name in _OF_MESSAGES:
+                    raise ConfigurationError(
+                        f"'{name}' cannot name a field: it is what every message has\n"
+                        f"  call it otherwise than {', '.join(_OF_MESSAGES)}"
                     )
                 if each.ragged or np.dtype(each.dtype) != np.float64:
                     raise ConfigurationError(f"field '{name}': bundles hold float64, not ragged")

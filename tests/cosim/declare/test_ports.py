@@ -209,3 +209,11 @@ def test_states_start_where_they_say(toys):
     toys.fly(toys.wire({"c": counter}, []), 3, members=2)
     assert counter.n.tolist() == [8, 8]
     assert counter.q.tolist() == [[0, 0, 0, 1]] * 2
+
+
+@pytest.mark.parametrize("name", ["t", "count", "valid", "value", "fresh", "sequence"])
+def test_what_every_message_has_cannot_name_a_field(name):
+    """Else publish() takes the field for its own argument, and a reader finds something else."""
+    with pytest.raises(ConfigurationError, match=f"'{name}' cannot name a field: it is what every"):
+        MessageOutput(fields={"r": Field((3,)), name: Field(())})
+    BundleOutput({name: Field(())})  # a signal has no such thing
