@@ -32,8 +32,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
 
 import casadi as ca
 import numpy as np
@@ -120,6 +119,42 @@ def outlines_seen(
         yield rows, Seen(own, told, given["vertices"][index], given["center"][lake]), starts
 
 
+Look = tuple[NDArray[np.intp], FloatArray, FloatArray]
+"""Rows of estimates that look at one lake, what they measure (k, m), its derivative (k, m, n)."""
+
+
+def both_at_once(
+    looks: Callable[[Arrays, Arrays], Iterable[Look]], m: int, n: int
+) -> tuple[Callable[[Arrays, Arrays], FloatArray], Callable[[Arrays, Arrays], FloatArray]]:
+    """Prediction and derivative, as an observation of ensembles has them, of looks at lakes.
+
+    Both are asked of the same estimates: what these see is kept from one to the other.
+    """
+    kept: list[tuple[Arrays, Arrays, list[Look]]] = []
+
+    def seen(values: Arrays, given: Arrays) -> list[Look]:
+        last = kept[:]  # another thread may put its own there meanwhile
+        if last and last[0][0] is values and last[0][1] is given:
+            return last[0][2]
+        found = list(looks(values, given))
+        kept[:] = [(values, given, found)]
+        return found
+
+    def predict(values: Arrays, given: Arrays) -> FloatArray:
+        y = np.empty((len(values["r"]), m))
+        for rows, own, _ in seen(values, given):
+            y[rows] = own
+        return y
+
+    def derivative(values: Arrays, given: Arrays) -> FloatArray:
+        H = np.empty((len(values["r"]), m, n))
+        for rows, _, own in seen(values, given):
+            H[rows] = own
+        return H
+
+    return predict, derivative
+
+
 def lake_observation(state: ErrorState) -> EnsembleObservation:
     """Moments of the outline of a lake of the catalog, which the fix names by its number.
 
@@ -128,40 +163,22 @@ def lake_observation(state: ErrorState) -> EnsembleObservation:
     columns = state_columns(state)
     off_outline = "outline" in [block.name for block in state]
 
-    # both are asked of the same estimates: what they see is kept from one to the other
-    kept: list[tuple[Arrays, list[Any]]] = []
-
-    def both(values: Arrays, given: Arrays) -> list[Any]:
-        last = kept[:]  # another thread may put its own there meanwhile
-        if last and last[0][0] is values:
-            return last[0][1]
-        looks = []
+    def looks(values: Arrays, given: Arrays) -> Iterator[Look]:
         for rows, seen, starts in outlines_seen(values, given):
-            m, J = moments(seen.pixels, starts)
-            look = {"m": m, "H": seen.derivative(J)[..., columns]}
+            y, J = moments(seen.pixels, starts)
+            H = seen.derivative(J)[..., columns]
             if off_outline:
-                look["L"] = seen.factor(J)
-                look["m"] = m + np.einsum("kij,kj->ki", look["L"], values["outline"][rows])
-                look["H"] = np.concatenate([look["H"], look["L"]], axis=2)
-            behind = seen.depth.min(axis=1) <= 0.0
-            look["m"][behind] = np.nan
-            looks.append((rows, look))
-        kept[:] = [(values, looks)]
-        return looks
+                L = seen.factor(J)
+                y = y + np.einsum("kij,kj->ki", L, values["outline"][rows])
+                H = np.concatenate([H, L], axis=2)
+            y[seen.depth.min(axis=1) <= 0.0] = np.nan
+            yield rows, y, H
 
-    def told(kind: str, *shape: int) -> Any:
-        def answer(values: Arrays, given: Arrays) -> FloatArray:
-            found = np.empty((len(values["r"]), *shape))
-            for rows, look in both(values, given):
-                found[rows] = look[kind]
-            return found
-
-        return answer
-
+    predict, derivative = both_at_once(looks, len(MOMENTS), state.size)
     return EnsembleObservation(
-        told("m", len(MOMENTS)),
+        predict,
         MOMENTS,
-        derivative=told("H", len(MOMENTS), state.size),
+        derivative=derivative,
         fields=[vector("lake", 1)],
         parameters=CAMERA,
         shared=CATALOG,

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,13 @@ from numpy.typing import NDArray
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.filters.ensembles import Arrays, EnsembleObservation
 from terrafix.models.filters.error_state import ErrorState, vector
-from terrafix.models.filters.lake import CATALOG, outlines_seen, state_columns
+from terrafix.models.filters.lake import (
+    CATALOG,
+    Look,
+    both_at_once,
+    outlines_seen,
+    state_columns,
+)
 from terrafix.models.images.shore import ELEMENTS, Crossings, Weights, crossings, places, weights
 from terrafix.models.sensors.camera import CAMERA, Seen
 
@@ -89,7 +94,7 @@ class _Fit:
     cost: float
 
 
-class _Look:
+class _Camera:
     """What one camera sees of one outline, from any estimate of one member."""
 
     def __init__(self, given: Mapping[str, FloatArray], points: FloatArray, center: FloatArray):
@@ -127,7 +132,7 @@ def match_shore(
     Weights or str
         Or which of `SHORE_REASONS` keeps it from being one.
     """
-    look = _Look(given, points, center)
+    look = _Camera(given, points, center)
     seen = look(x0)
     if shore.shown.sum() < _LEAST:
         return "too little shore"
@@ -169,7 +174,7 @@ def _spread(seen: Seen, P: FloatArray) -> FloatArray:
 
 
 def _starts(
-    look: _Look, x0: FloatArray, P0: FloatArray, information: FloatArray, shore: Shore
+    look: _Camera, x0: FloatArray, P0: FloatArray, information: FloatArray, shore: Shore
 ) -> list[FloatArray]:
     """Estimates from which the predicted outline lies near the one that was seen."""
     seen = look(x0)
@@ -203,7 +208,7 @@ def _starts(
 
 
 def _fit(
-    look: _Look,
+    look: _Camera,
     x0: FloatArray,
     start: FloatArray,
     information: FloatArray,
@@ -267,24 +272,14 @@ def shore_observation(state: ErrorState) -> EnsembleObservation:
     """
     columns = state_columns(state)
 
-    def each_lake(values: Arrays, given: Arrays) -> Iterator[tuple[Any, Seen, FloatArray]]:
+    def looks(values: Arrays, given: Arrays) -> Iterator[Look]:
         shores = {name: told for name, told in given.items() if name != "owner"}
         for rows, seen, _ in outlines_seen(values, shores):
             W = given["weights"][rows].reshape(-1, ELEMENTS, MOST_VERTICES, 2)
-            yield rows, seen, W[:, :, : seen.pixels.shape[1]]
+            W = W[:, :, : seen.pixels.shape[1]]
+            yield rows, _sums(W, seen.pixels), seen.derivative(W)[..., columns]
 
-    def predict(values: Arrays, given: Arrays) -> FloatArray:
-        found = np.empty((len(values["r"]), ELEMENTS))
-        for rows, seen, W in each_lake(values, given):
-            found[rows] = _sums(W, seen.pixels)
-        return found
-
-    def derivative(values: Arrays, given: Arrays) -> FloatArray:
-        found = np.empty((len(values["r"]), ELEMENTS, state.size))
-        for rows, seen, W in each_lake(values, given):
-            found[rows] = seen.derivative(W)[..., columns]
-        return found
-
+    predict, derivative = both_at_once(looks, ELEMENTS, state.size)
     return EnsembleObservation(
         predict,
         SHORE,
