@@ -7,7 +7,6 @@ import numpy as np
 from terrafix.components.fields import CLEARANCE_FIX, GRID, HEIGHT, HEIGHT_FIX
 from terrafix.components.noisy import NoisyComponent
 from terrafix.components.shared import require_earth
-from terrafix.components.truth.terrain import dem_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -16,6 +15,7 @@ from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import Input, MessageOutput, Output, SharedInput
 from terrafix.models.core.model import Model
 from terrafix.models.maps.charts import ORIGIN, geodetic_of
+from terrafix.models.maps.dem import dem_from
 from terrafix.models.motion.strapdown import EARTHS
 from terrafix.models.sensors.altimeter import altimeter_model
 
