@@ -150,6 +150,7 @@ def synthetic_shift_model(
     y = shift_of(p_t - own["r_center"], own["v_center"], a, speed)
     y += ca.vertcat(own["range_bias"], own["cross_range_bias"], 0)
     sent = ca.logic_and(ca.logic_not(at_center), own["count"] > 0.5)
+    sent = ca.logic_and(sent, time - own["t_mid"] < 1.5 * dt)  # the step after a center, once
     sent = ca.logic_and(sent, _banked(r, q, earth) <= ca.sin(parameters["largest_bank"]))
     sent = ca.logic_and(sent, on)
     given = _measured(y, sigmas, ca.vertcat(*noise.values())) | {
