@@ -15,9 +15,9 @@ from matplotlib.patches import Polygon
 
 import terrafix as tf
 from terrafix.components.fields import APERTURE_IMAGE, GRID, HEIGHT, PLACES, TIES
-from terrafix.components.truth.terrain import dem_from
 from terrafix.models.geometry.ground import FlatGround
 from terrafix.models.images.reference import Reference
+from terrafix.models.maps.dem import dem_from
 from terrafix.models.radar.aperture_image import PixelGrid
 from terrafix.models.radar.compensation import StraightLine
 

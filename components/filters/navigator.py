@@ -102,17 +102,22 @@ class RadarInertialPredict(InertialPredict):
     cross_range_bias_time = _time(100.0)
 
 
-class AltimeterCorrect(FilterCorrect):
-    """Correction by the height that an altimeter measures; without a radar."""
+class _OnEarth(FilterCorrect):
+    """Correction on an Earth that is chosen: base."""
 
     default_rate = Rate("1", offset="1")
-    error_state, observation = DRIFTING, altimeter_observation("wgs84")
 
     earth = Choice(EARTHS, "wgs84", doc="that of the filter")
 
     def _initialize_impl(self) -> None:
         require_earth(self, self.setting("earth"), self.port_views["prior"].r_e)
         super()._initialize_impl()
+
+
+class AltimeterCorrect(_OnEarth):
+    """Correction by the height that an altimeter measures; without a radar."""
+
+    error_state, observation = DRIFTING, altimeter_observation("wgs84")
 
     def chosen_observation(self) -> Observation:
         """What is observed on the chosen Earth."""
@@ -125,43 +130,30 @@ class RadarAltimeterCorrect(AltimeterCorrect):
     error_state = NAVIGATOR
 
 
-class ShiftCorrect(FilterCorrect):
+class ShiftCorrect(_OnEarth):
     """Correction by the image of an aperture: range, cross-range, and what map drift reads."""
 
-    default_rate = Rate("1", offset="1")
     error_state, observation = NAVIGATOR, shift_observation("wgs84")
-
-    earth = Choice(EARTHS, "wgs84", doc="that of the filter")
-
-    def _initialize_impl(self) -> None:
-        require_earth(self, self.setting("earth"), self.port_views["prior"].r_e)
-        super()._initialize_impl()
 
     def chosen_observation(self) -> Observation:
         """What is observed on the chosen Earth."""
         return shift_observation(self.setting("earth"))
 
 
-class ClearanceCorrect(EnsembleCorrect):
+class ClearanceCorrect(_OnEarth, EnsembleCorrect):
     """Correction by the clearance over an elevation model: terrain contour matching, in a filter.
 
     A member whose estimate has left the model, where no ground is known, fails.
     """
 
-    default_rate = Rate("1", offset="1")
     error_state, observation = DRIFTING, clearance_observation(DRIFTING, "wgs84")
 
-    earth = Choice(EARTHS, "wgs84", doc="that of the filter")
     latitude0 = Parameter(0.0, unit="rad", minimum=-_POLE, maximum=_POLE, doc="origin (flat)")
     longitude0 = Parameter(
         0.0, unit="rad", minimum=-2 * np.pi, maximum=2 * np.pi, doc="origin (flat)"
     )
     height = SharedInput(**HEIGHT, doc="heights of the ground")
     grid = SharedInput(**GRID, doc="where they lie")
-
-    def _initialize_impl(self) -> None:
-        require_earth(self, self.setting("earth"), self.port_views["prior"].r_e)
-        super()._initialize_impl()
 
     def chosen_observation(self) -> EnsembleObservation:
         """What is observed on the chosen Earth."""
@@ -178,17 +170,10 @@ class RadarClearanceCorrect(ClearanceCorrect):
     error_state, observation = NAVIGATOR, clearance_observation(NAVIGATOR, "wgs84")
 
 
-class PlaceCorrect(FilterCorrect):
+class PlaceCorrect(_OnEarth):
     """Correction by a profile that was matched with an elevation model; without a radar."""
 
-    default_rate = Rate("1", offset="1")
     error_state, observation = DRIFTING, place_observation("wgs84")
-
-    earth = Choice(EARTHS, "wgs84", doc="that of the filter")
-
-    def _initialize_impl(self) -> None:
-        require_earth(self, self.setting("earth"), self.port_views["prior"].r_e)
-        super()._initialize_impl()
 
     def chosen_observation(self) -> Observation:
         """What is observed on the chosen Earth."""

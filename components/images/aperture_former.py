@@ -7,7 +7,6 @@ import numpy as np
 from terrafix.components.fields import APERTURE_IMAGE, GRID, HEIGHT, MOTION, PULSES, RADAR, XYZ
 from terrafix.components.ground import OnGround, height_in_swath
 from terrafix.components.sensors.aircraft_radar import part_about
-from terrafix.components.truth.terrain import dem_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.parameters import Flag, Parameter
@@ -24,7 +23,7 @@ from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.arrays import Single
 from terrafix.models.core.model import Model
 from terrafix.models.filters.aperture_fix import estimated_track_model
-from terrafix.models.maps.dem import Dem
+from terrafix.models.maps.dem import Dem, dem_from
 from terrafix.models.radar.aperture import Antenna, flown_aperture
 from terrafix.models.radar.aperture_image import (
     ApertureEcho,

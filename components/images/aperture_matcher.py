@@ -16,7 +16,6 @@ from terrafix.components.fields import (
     XYZ,
 )
 from terrafix.components.ground import OnGround
-from terrafix.components.truth.terrain import dem_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -40,7 +39,7 @@ from terrafix.models.images.aperture_matching import (
     search_reach,
 )
 from terrafix.models.images.reference import Reference
-from terrafix.models.maps.dem import Dem
+from terrafix.models.maps.dem import Dem, dem_from
 from terrafix.models.radar.aperture_image import PixelGrid
 from terrafix.models.radar.compensation import StraightLine
 from terrafix.models.sensors.aperture import ROWS

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from terrafix.components.fields import AMPLITUDE, ESTIMATE, FIX, GRID, HEIGHT, IMAGE, PLACES, TIES
-from terrafix.components.truth.terrain import dem_from
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -23,7 +22,7 @@ from terrafix.models.geometry.geodesy import ecef, geodetic
 from terrafix.models.geometry.geolocation import ground_point, track_axes
 from terrafix.models.images.matching import KINDS, REASONS, Match, Searchable, matched
 from terrafix.models.images.reference import Reference
-from terrafix.models.maps.dem import Dem
+from terrafix.models.maps.dem import Dem, dem_from
 
 
 class ImageMatcher(Component):

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from terrafix.components.fields import CLEARANCE_FIX, GRID, HEIGHT, PLACE_FIX
 from terrafix.components.shared import require_earth
-from terrafix.components.truth.terrain import dem_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.component import Component, Environment
@@ -22,6 +21,7 @@ from terrafix.cosim.declare.ports import (
 )
 from terrafix.models.maps.charts import ORIGIN, geodetic_of
 from terrafix.models.maps.contours import match_profile
+from terrafix.models.maps.dem import dem_from
 from terrafix.models.motion.strapdown import EARTHS
 
 _POLE = np.pi / 2

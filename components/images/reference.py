@@ -20,7 +20,7 @@ from terrafix.components.sensors.files import (
     require_files,
 )
 from terrafix.components.shared import common, generator, require_common
-from terrafix.components.truth.terrain import dem_from, scene_from
+from terrafix.components.truth.terrain import scene_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
@@ -28,6 +28,7 @@ from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Parameter
 from terrafix.cosim.declare.ports import Input, MessageInput, SharedInput, SharedOutput
 from terrafix.models.geometry.geolocation import track_axes
 from terrafix.models.images.reference import Reference, earlier_pass, geocoded, read_reference
+from terrafix.models.maps.dem import dem_from
 from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.motion.sampled import SampledArc
 from terrafix.models.radar.boresight import boresight_on_terrain

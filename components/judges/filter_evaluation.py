@@ -279,13 +279,19 @@ class FilterEvaluation(Evaluation):
 def _check(cls: type[FilterEvaluation]) -> None:
     """Raise ValueError if names of a subclass do not fit its error state."""
     names = [block.name for block in cls.error_state.present]
-    for kind, given in (("judged", cls.judged), ("called", cls.called)):
+    kinds = (("judged", cls.judged), ("called", cls.called), ("turned", cls.turned))
+    for kind, given in kinds:
         for name in given:
             if name not in names:
                 raise ValueError(
                     f"{cls.__name__}.{kind} names '{name}', which is no block of its error state; "
                     f"the blocks are {', '.join(names)}"
                 )
+    if cls.turned and cls.rotation is FilterEvaluation.rotation:
+        raise ValueError(
+            f"{cls.__name__} tells errors of {', '.join(cls.turned)} in other axes: it needs a "
+            "method `rotation` that transforms to these"
+        )
     if cls.observation is not None and cls.observations:
         raise ValueError(
             f"{cls.__name__} has one observation or several observations by name, not both"

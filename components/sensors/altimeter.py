@@ -7,7 +7,6 @@ import numpy as np
 from terrafix.components.fields import CLEARANCE_FIX, GRID, HEIGHT, HEIGHT_FIX
 from terrafix.components.noisy import NoisyComponent
 from terrafix.components.shared import require_earth
-from terrafix.components.truth.terrain import dem_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -16,6 +15,7 @@ from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import Input, MessageOutput, Output, SharedInput
 from terrafix.models.core.model import Model
 from terrafix.models.maps.charts import ORIGIN, geodetic_of
+from terrafix.models.maps.dem import Dem, dem_from
 from terrafix.models.motion.strapdown import EARTHS
 from terrafix.models.sensors.altimeter import altimeter_model
 
@@ -74,29 +74,31 @@ class RadarAltimeter(Component):
     def _initialize_impl(self) -> None:
         require_earth(self, self.setting("earth"), self.r_e)
         if self.on:
-            self._check_track(self._clearance(), "at t = 0")
+            self._clearance("at t = 0")
 
     def _step_impl(self, t: float, dt: float) -> None:
         if not self.on:
             return
-        clearance = self._clearance()
-        self._check_track(clearance, f"at t = {t:g} s")
+        clearance = self._clearance(f"at t = {t:g} s")
         y = np.nan_to_num(clearance) + self.sigma * self.normals("noise", 1)[:, 0]
         self.fix.publish(
             t, y=y[:, None], R=(self.sigma**2)[:, None, None], present=np.ones((self.n_members, 1))
         )
 
-    def _clearance(self) -> FloatArray:
-        """True clearance (n_members,) [m]; NaN where the ground is not known."""
+    def _clearance(self, when: str) -> FloatArray:
+        """True clearance (n_members,) [m]; members that are off the map, or below it, fail."""
         where = geodetic_of(self.r_e, self.setting("earth"), (self.latitude0, self.longitude0))
-        self._where = where
-        return np.asarray(where[2] - dem_from(self.height, self.grid).known_at(*where[:2]))
+        dem = dem_from(self.height, self.grid)
+        clearance = np.asarray(where[2] - dem.known_at(*where[:2]))
+        self._check_track(clearance, where, dem, when)
+        return clearance
 
-    def _check_track(self, clearance: FloatArray, when: str) -> None:
+    def _check_track(
+        self, clearance: FloatArray, where: tuple[FloatArray, ...], dem: Dem, when: str
+    ) -> None:
         """Fail members that are where no ground is known, or below it: the run, if all are."""
         active = self.environment.active
-        dem = dem_from(self.height, self.grid)
-        latitude, longitude, height = self._where
+        latitude, longitude, height = where
         for wrong, told in (
             (np.isnan(clearance), f"where no ground is known: it is {dem.described()}"),
             (clearance < 0.0, "below the ground"),

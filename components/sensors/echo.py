@@ -20,7 +20,7 @@ from terrafix.components.sensors.files import (
     require_files,
 )
 from terrafix.components.shared import common, generator, require_common, shared_setting
-from terrafix.components.truth.terrain import dem_from, scene_from
+from terrafix.components.truth.terrain import scene_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.basics.machine import require_memory
@@ -28,6 +28,7 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Count, FilePath, Parameter, Text
 from terrafix.cosim.declare.ports import Input, MessageOutput, SharedInput, SharedOutput
 from terrafix.models.core.arrays import ComplexArray
+from terrafix.models.maps.dem import dem_from
 from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.radar.boresight import Boresight, boresight_on_terrain
 from terrafix.models.radar.chirp import Radar

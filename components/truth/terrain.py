@@ -20,6 +20,7 @@ from terrafix.models.maps.dem import (
     HIGHEST,
     LOWEST,
     Dem,
+    dem_from,
     flat_dem,
     read_dem,
     read_jacksboro,
@@ -156,12 +157,6 @@ class Terrain(Component):
 
     def _step_impl(self, t: float, dt: float) -> None:
         """Say nothing more."""
-
-
-def dem_from(height: Single, grid: FloatArray) -> Dem:
-    """Elevation model of the ports of a terrain, without copying it."""
-    south, west, north, east, mirrored = (float(g) for g in grid)
-    return Dem(height, south, west, north, east, mirrored=bool(mirrored))
 
 
 def scene_from(height: Single, grid: FloatArray, surface: FloatArray) -> Scene:

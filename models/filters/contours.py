@@ -18,7 +18,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -30,17 +29,11 @@ from terrafix.models.filters.ensembles import Arrays, EnsembleObservation
 from terrafix.models.filters.error_state import ErrorState, vector
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.maps.charts import ORIGIN, geodetic_of, level_axes_of, scales_of
-from terrafix.models.maps.dem import Dem
+from terrafix.models.maps.dem import Dem, dem_from
 from terrafix.models.motion.strapdown import level_axes, rotation_rate
 
 SHARED = ("height", "grid")
 """Arrays of an elevation model: heights, and where they lie."""
-
-
-def dem_of(told: Mapping[str, Any]) -> Dem:
-    """Elevation model of shared arrays."""
-    south, west, north, east, mirrored = (float(g) for g in told["grid"])
-    return Dem(told["height"], south, west, north, east, mirrored=bool(mirrored))
 
 
 def clearance_observation(state: ErrorState, earth: str) -> EnsembleObservation:
@@ -58,7 +51,8 @@ def clearance_observation(state: ErrorState, earth: str) -> EnsembleObservation:
 
     def where(estimate: Arrays, told: Arrays) -> tuple[Dem, FloatArray, FloatArray, FloatArray]:
         origin = tuple(np.reshape(told[name], -1) for name in ORIGIN)
-        return dem_of(told), *geodetic_of(estimate["r_e"], earth, (origin[0], origin[1]))
+        dem = dem_from(told["height"], told["grid"])
+        return dem, *geodetic_of(estimate["r_e"], earth, (origin[0], origin[1]))
 
     def predict(estimate: Arrays, told: Arrays) -> NDArray[Any]:
         dem, latitude, longitude, height = where(estimate, told)

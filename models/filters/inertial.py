@@ -22,7 +22,7 @@ plus noise.
 
 References
 ----------
-.. [1] The aircraft paper (`docs/flight.md`), eqs. (25)-(36) and (44).
+.. [1] The aircraft paper (`docs/aircraft.md`), eqs. (25)-(36) and (44).
 .. [2] P. D. Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems",
        2nd edition, 2013, section 14.2.3 (ECEF-frame state propagation).
 """

@@ -78,7 +78,7 @@ def predict_model(
         If a block is neither told nor has a sigma, or both, or does not exist; or it restarts
         and no block is told.
     """
-    _check_start(name, state, told, sigmas)
+    _check_start(name, state, told, sigmas, restarts)
     inputs = {key: ca.SX.sym(key, size) for key, size in process.inputs.items()}
     parameters = {key: ca.SX.sym(key, size) for key, size in process.named().items()}
     own, posterior = state.symbols("own"), state.symbols("posterior")
@@ -90,16 +90,10 @@ def predict_model(
     start, initial = _start("start", state, told, own_sigma)
     given_up = ca.SX(0)
     if restarts:
-        if not told:
-            raise ValueError(
-                f"filter '{name}' restarts, and no block is told: name in `told` what a start "
-                "message says"
-            )
         again, anew = _start("restart", state, told, own_sigma)
-        afresh = start["restart.fresh"] = ca.SX.sym("restart_fresh")
-        start |= again
-        begin = {key: ca.if_else(afresh > 0.5, anew[key], begin[key]) for key in begin}
-        given_up = afresh
+        given_up = ca.SX.sym("restart_fresh")
+        start |= {"restart.fresh": given_up} | again
+        begin = {key: ca.if_else(given_up > 0.5, anew[key], begin[key]) for key in begin}
     marks = {instant: ca.SX.sym(f"{instant}_fresh") for instant in state.instants}
     gone = ca.SX.sym("transition", state.size, state.size)
     phi = ca.if_else(ca.fmax(fresh, given_up) > 0.5, ca.SX.eye(state.size), gone)
@@ -145,9 +139,9 @@ def predict_model(
 
 
 def _check_start(
-    name: str, state: ErrorState, told: Sequence[str], sigmas: Mapping[str, str]
+    name: str, state: ErrorState, told: Sequence[str], sigmas: Mapping[str, str], restarts: bool
 ) -> None:
-    """Raise ValueError if a block is neither told nor has a sigma, or both, or does not exist."""
+    """Raise ValueError where a start, or one anew, is not said as `predict_model` takes it."""
     names = [block.name for block in state]
     for block in [*told, *sigmas]:
         if block not in names:
@@ -161,6 +155,11 @@ def _check_start(
                 f"block '{block}' of filter '{name}' starts from a message or from a sigma: "
                 "say one of them"
             )
+    if restarts and not told:
+        raise ValueError(
+            f"filter '{name}' restarts, and no block is told: name in `told` what a start message "
+            "says"
+        )
 
 
 def _start(
@@ -233,7 +232,8 @@ def correct_model(
     -------
     Model
         Inputs ``prior.*``; ``fix.*``, as `Observation.shapes` has it, ``fix.fresh`` and the time
-        ``fix.t`` [s], which must be that of the prior; those of the observation. Parameters
+        ``fix.t`` [s], in its place the field `Observation.valid_at` if there is one, which must be
+        that of the prior, or of its clone; those of the observation. Parameters
         ``gate`` (m,), the largest normalized innovation squared accepted with 1 to m elements
         (infinity: all), and those of the observation. Outputs ``estimate.*``: the posterior where
         there is one, else the prior; ``posterior.*``, the same and ``posterior.valid``;

@@ -33,6 +33,11 @@ from terrafix.models.maps.dem import Dem
 REASONS = ("matched", "no place fits", "several places fit", "at the edge of the search")
 """What became of a profile, indexed by `Match.reason`."""
 
+MOST_MISFIT = 2.0
+"""Largest misfit of a profile that is of here."""
+LEAST_MARGIN = 30.0
+"""By how much J must be larger at every other place."""
+
 _FINER = 5
 """Points of the second grid between two of the first."""
 _APART = 3
@@ -73,8 +78,6 @@ def match_profile(
     height_sigma: float,
     reach: float,
     step: float,
-    largest_misfit: float = 2.0,
-    least_margin: float = 30.0,
 ) -> Match:
     """Find the shift of a profile.
 
@@ -87,8 +90,6 @@ def match_profile(
         Noise of a height, and of the height common to all [m].
     reach, step : float
         Half of the square that is searched, and the spacing of the first grid [m].
-    largest_misfit, least_margin : float
-        Beyond which a match is refused.
     """
 
     def misfit(north: FloatArray, east: FloatArray) -> FloatArray:
@@ -116,11 +117,11 @@ def match_profile(
     shift, covariance = _moments(north, east, np.exp(-(fine - least) / 2))
     covariance += (step / _FINER) ** 2 / 12 * np.eye(2)
     reason = "matched"
-    if margin < least_margin:
+    if margin < LEAST_MARGIN:
         reason = "several places fit"
     elif max(abs(i - n), abs(j - n)) > n - 2:
         reason = "at the edge of the search"
-    if least / len(ground) > largest_misfit:
+    if least / len(ground) > MOST_MISFIT:
         reason = "no place fits"
     return Match(shift, covariance, least / len(ground), margin, REASONS.index(reason))
 

@@ -223,6 +223,20 @@ def _place(latitude: float, longitude: float) -> str:
     return f"latitude {np.degrees(latitude):.4f}, longitude {np.degrees(longitude):.4f} deg"
 
 
+def dem_from(height: Single, grid: ArrayLike) -> Dem:
+    """Elevation model on a grid, without copying its heights.
+
+    Parameters
+    ----------
+    height : ndarray, shape (n, m)
+        [m]
+    grid : array_like, shape (5,)
+        First latitude and longitude, their steps [rad], and whether it is mirrored.
+    """
+    south, west, north, east, mirrored = (float(g) for g in np.asarray(grid))
+    return Dem(height, south, west, north, east, mirrored=bool(mirrored))
+
+
 def flat_dem(height: float = 0.0) -> Dem:
     """Everywhere the same height [m]: zero is the sea."""
     grid = np.full((2, 2), height, np.float32)

@@ -341,29 +341,34 @@ def flight_model(
     ahead, right, down = ca.vertsplit(air.off_v)
     off_n = ca.vertcat(c * ahead - s * right, s * ahead + c * right, down)
     v_e = ca.mtimes(axes.T, now.v_n + off_n)
-    level = ca.mtimes(coordinated_axes(now.v_n - wind, now.a_n - _G), axes)
     turn = from_small_rotation_vector(air.off_angles)
-    q_be = product(turn, from_matrix_near(level, motion.q_be))
+    q_be = product(turn, from_matrix_near(_body_axes(now, wind, axes), motion.q_be))
     dv, dtheta = increments_between(motion, v_e, q_be, dt, earth)
     end = mechanized(motion, dv, dtheta, dt, earth)
-
-    first = planned(rates, begin.course, begin.speed, ca.SX(0))
-    place = (begin.latitude, begin.longitude)
-    upright = from_level(*place, begin.height, first.v_n, ca.SX.zeros(3), earth, place)
-    body = ca.mtimes(
-        coordinated_axes(first.v_n - wind, first.a_n - _G), level_axes(upright.r_e, earth)
-    )
-    initial = upright.named | {"q_be": from_matrix(body)}
     return Model(
         f"flight_{earth}_{turbulence}".replace("-", "_"),
         states=motion.named | increments | air.states,
         parameters=parameters,
         noise=air.noise,
         next=end.named | {"delta_v_b": dv, "delta_theta_b": dtheta} | air.next,
-        initial=initial | air.initial,
+        initial=_begun(begin, rates, wind, earth) | air.initial,
         outputs=motion.named
         | increments
         | {"delta_v_end_b": at_end(**increments), "gust": air.gust},
         step=dt,
         time=t,
     )
+
+
+def _body_axes(plan: Planned, wind: Any, axes: Any) -> Any:
+    """Transformation (3, 3), e to body, of who flies a plan in a wind; `axes` are e to level."""
+    return ca.mtimes(coordinated_axes(plan.v_n - wind, plan.a_n - _G), axes)
+
+
+def _begun(begin: Start, rates: Sequence[Rates], wind: Any, earth: str) -> dict[str, Any]:
+    """Motion at the start of a plan."""
+    first = planned(rates, begin.course, begin.speed, ca.SX(0))
+    place = (begin.latitude, begin.longitude)
+    upright = from_level(*place, begin.height, first.v_n, ca.SX.zeros(3), earth, place)
+    body = _body_axes(first, wind, level_axes(upright.r_e, earth))
+    return upright.named | {"q_be": from_matrix(body)}

@@ -46,7 +46,7 @@ References
 .. [1] P. G. Savage, "Strapdown Inertial Navigation Integration Algorithm Design Part 1: Attitude
        Algorithms", J. Guidance, Control, and Dynamics 21(1), 1998.
 .. [2] P. G. Savage, "... Part 2: Velocity and Position Algorithms", ibid. 21(2), 1998.
-.. [3] The aircraft paper (`docs/flight.md`), eqs. (21)-(25).
+.. [3] The aircraft paper (`docs/aircraft.md`), eqs. (21)-(25).
 .. [4] P. D. Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems",
        2nd edition, 2013, section 5.3 (ECEF-frame navigation equations).
 """

@@ -15,14 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import atan2, cos, hypot, isfinite, pi, radians, remainder, sin, sqrt, tan
+from math import atan2, cos, hypot, isfinite, pi, radians, remainder, sin, tan
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from scipy.integrate import quad
 
-from terrafix.models.geometry.earth import EARTH
 from terrafix.models.motion.flight import BLEND, Segment, Start, blend
 from terrafix.models.motion.gravity import STANDARD_GRAVITY
 from terrafix.models.motion.strapdown import chart_scales, rotation_rate
@@ -127,35 +126,28 @@ def _leg(a: Waypoint, b: Waypoint, origin: Waypoint, earth: str) -> tuple[float,
     """Course [rad] and length [m] from one waypoint to the next."""
     east = remainder(b.longitude - a.longitude, 2 * pi)
     if not rotation_rate(earth):
-        scales = [float(s) for s in chart_scales(ca.DM(origin.latitude))]
-        north, across = scales[0] * (b.latitude - a.latitude), scales[1] * east
+        meridian, parallel = _scales(origin.latitude)
+        north, across = meridian * (b.latitude - a.latitude), parallel * east
         return atan2(across, north), hypot(across, north)
     height = (a.height + b.height) / 2
-    north = _integral(lambda p: _meridian(p) + height, a.latitude, b.latitude)
+    north = _integral(lambda p: _scales(p, height)[0], a.latitude, b.latitude)
     stretched = _integral(
-        lambda p: (_meridian(p) + height) / _parallel(p, height), a.latitude, b.latitude
+        lambda p: _scales(p, height)[0] / _scales(p, height)[1], a.latitude, b.latitude
     )
     course = atan2(east, stretched)
     if abs(cos(course)) > 0.1:
         return course, north / cos(course)
-    return course, _parallel((a.latitude + b.latitude) / 2, height) * east / sin(course)
+    return course, _scales((a.latitude + b.latitude) / 2, height)[1] * east / sin(course)
 
 
 def _integral(function: Callable[[float], float], a: float, b: float) -> float:
     return float(quad(function, a, b, epsabs=0, epsrel=1e-13)[0])
 
 
-def _flatter(latitude: float) -> float:
-    return 1 - EARTH.flattening * (2 - EARTH.flattening) * sin(latitude) ** 2
-
-
-def _meridian(latitude: float) -> float:
-    e2 = EARTH.flattening * (2 - EARTH.flattening)
-    return EARTH.radius * (1 - e2) / sqrt(_flatter(latitude)) ** 3
-
-
-def _parallel(latitude: float, height: float) -> float:
-    return (EARTH.radius / sqrt(_flatter(latitude)) + height) * cos(latitude)
+def _scales(latitude: float, height: float = 0.0) -> tuple[float, float]:
+    """Meters north for a radian of latitude, and east for one of longitude, at a height [m]."""
+    meridian, parallel = chart_scales(latitude)
+    return float(meridian) + height, float(parallel) + height * cos(latitude)
 
 
 def _corner(turn: float, bank: float, speed: float) -> _Corner:

@@ -129,12 +129,7 @@ def synthetic_shift_model(
     noise = {name: ca.SX.sym(name) for name in ("range_noise", "cross_range_noise")}
     drives = {f"{name}_noise": ca.SX.sym(f"{name}_noise") for name in _BIASES}
     at_center = fresh > 0.5
-    following = {
-        "r_center": ca.if_else(at_center, r, own["r_center"]),
-        "v_center": ca.if_else(at_center, v, own["v_center"]),
-        "t_mid": ca.if_else(at_center, time, own["t_mid"]),
-        "count": own["count"] + ca.if_else(at_center, 1, 0),
-    }
+    following = _at_center(own, at_center, r, v, time)
     for name in _BIASES:
         sigma, tau = parameters[f"{name}_sigma"], parameters[f"{name}_time"]
         following[name] = wandering(own[name], sigma, tau, drives[f"{name}_noise"], dt)
@@ -154,21 +149,16 @@ def synthetic_shift_model(
     sigmas = ca.vertcat(*(parameters[f"{name.removesuffix('_noise')}_sigma"] for name in noise))
     y = shift_of(p_t - own["r_center"], own["v_center"], a, speed)
     y += ca.vertcat(own["range_bias"], own["cross_range_bias"], 0)
-    measured = len(noise)
-    errors = ca.vertcat(sigmas * ca.vertcat(*noise.values()), ca.SX.zeros(3 - measured))
-    present = ca.vertcat(ca.SX.ones(measured), ca.SX.zeros(3 - measured))
     sent = ca.logic_and(ca.logic_not(at_center), own["count"] > 0.5)
+    sent = ca.logic_and(sent, time - own["t_mid"] < 1.5 * dt)  # the step after a center, once
     sent = ca.logic_and(sent, _banked(r, q, earth) <= ca.sin(parameters["largest_bank"]))
     sent = ca.logic_and(sent, on)
-    given = {
-        "y": (y + errors) * present,
+    given = _measured(y, sigmas, ca.vertcat(*noise.values())) | {
         "p_t_e": p_t,
         "speed": speed,
         "f_b": inputs.get("f_b", ca.SX.zeros(3)),
         CENTER: own["t_mid"],
-        "R": ca.diag(ca.vertcat(sigmas**2, ca.SX.ones(3 - measured))),
         "F": (parameters["force_sigma"] ** 2 if drift else 0) * ca.SX.eye(3),
-        "present": present,
     }
     return Model(
         f"synthetic_shift_{earth}_{looks}_{rows}{'' if on else '_off'}".replace("-", "_"),
@@ -198,6 +188,23 @@ _PARAMETERS = (
     *("ground_range", "ground", "largest_bank", "range_sigma", "cross_range_sigma"),
     *(f"{name}_{what}" for name in _BIASES for what in ("sigma", "time")),
 )
+
+
+def _at_center(own: dict[str, Any], at_center: Any, r: Any, v: Any, time: Any) -> dict[str, Any]:
+    """Position, velocity and time at the last center, and how many there were."""
+    now = {"r_center": r, "v_center": v, "t_mid": time, "count": own["count"] + 1}
+    return {name: ca.if_else(at_center, value, own[name]) for name, value in now.items()}
+
+
+def _measured(y: Any, sigmas: Any, noise: Any) -> dict[str, Any]:
+    """Fields of what was measured: the first elements of y, as many as there is noise."""
+    m = noise.numel()
+    present = ca.vertcat(ca.SX.ones(m), ca.SX.zeros(3 - m))
+    return {
+        "y": (y + ca.vertcat(sigmas * noise, ca.SX.zeros(3 - m))) * present,
+        "R": ca.diag(ca.vertcat(sigmas**2, ca.SX.ones(3 - m))),
+        "present": present,
+    }
 
 
 def _point(r: Any, v: Any, away: Any, ground: Any, earth: str) -> Any:

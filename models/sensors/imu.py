@@ -33,6 +33,7 @@ from typing import Any
 import casadi as ca
 
 from terrafix.models.core.model import Model
+from terrafix.models.sensors.altimeter import wandering
 
 BIASES = ("walk", "gauss-markov", "both")
 """Names of the bias processes."""
@@ -147,7 +148,7 @@ def add_bias(draft: Draft, kind: str, bias: str) -> tuple[Any, Any]:
     if bias == "gauss-markov":
         tau = draft.parameter(f"{kind}_bias_time")
         driven = walk * ca.sqrt(tau / 2)
-        following = _markov(b, ca.if_else(walk > 0, driven, sigma0), tau, draft.dt, drive)
+        following = wandering(b, ca.if_else(walk > 0, driven, sigma0), tau, drive, draft.dt)
     else:
         following = b + walk * ca.sqrt(draft.dt) * drive
     draft.next[f"{kind}_bias_b"] = following
@@ -162,11 +163,5 @@ def add_markov(draft: Draft, name: str, sigma: Any, tau: Any) -> tuple[Any, Any]
     """Add a Gauss-Markov process in its steady state: its value now, and at the end of the step."""
     x, drive = draft.state(name, 3), draft.noise(f"{name}_noise", 3)
     draft.initial[name] = sigma * drive
-    draft.next[name] = following = _markov(x, sigma, tau, draft.dt, drive)
+    draft.next[name] = following = wandering(x, sigma, tau, drive, draft.dt)
     return x, following
-
-
-def _markov(x: Any, sigma: Any, tau: Any, dt: Any, drive: Any) -> Any:
-    """Take a first-order process over a step that keeps its variance sigma^2."""
-    decay = ca.exp(-dt / tau)
-    return decay * x + sigma * ca.sqrt(1 - decay * decay) * drive

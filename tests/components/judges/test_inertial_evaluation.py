@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from terrafix.components.judges.evaluation import RadarInertialEvaluation
+from terrafix.components.judges.filter_evaluation import FilterEvaluation
 from terrafix.models.core.batch import over_members
+from terrafix.models.filters.error_state import ErrorState, vector
 from terrafix.models.geometry.geodesy import ecef_from_geodetic_array, north_east_down
 
 
@@ -36,3 +38,17 @@ def test_the_error_model_turns_what_lies_in_e(earth):
     axes = np.eye(3) if earth == "flat" else axes
     assert error[:3] == pytest.approx(axes @ off, abs=1e-9)
     assert error[6:9] == pytest.approx(axes @ (2 * half), abs=1e-8)
+
+
+def test_errors_in_other_axes_need_a_rotation_and_blocks_that_are_there():
+    """Said where the class is declared, not in the middle of a run."""
+    level = ("n", "north", "east", "down")
+    with pytest.raises(ValueError, match=r"errors of r in other axes: it needs .* `rotation`"):
+
+        class Unturned(FilterEvaluation):
+            error_state, turned = ErrorState(vector("r")), {"r": level}
+
+    with pytest.raises(ValueError, match=r"turned names 'v', which is no block .* are r"):
+
+        class Misnamed(FilterEvaluation):
+            error_state, turned = ErrorState(vector("r")), {"v": level}

@@ -69,8 +69,11 @@ def test_a_start_is_off_as_it_says_in_level_axes(earth):
     assert down @ P[0, 6:, 6:] @ down == pytest.approx(4e-6, rel=1e-2)
 
 
-def sent(looks, *, earth="flat", apertures=3, off=(0.0, 0.0, 0.0), rows="shift", **told):
-    """Fixes of a model that flies north at 70 m/s, its estimate of the center off by `off`."""
+def sent(looks, *, earth="flat", apertures=3, every=2, off=(0.0, 0.0, 0.0), rows="shift", **told):
+    """Fixes of a model that flies north at 70 m/s, its estimate of the center off by `off`.
+
+    A step of half a second is a center once in `every`.
+    """
     model = synthetic_shift_model(earth, looks, rows)
     step = model.step_function()
     names = [*model.inputs, *model.states, *model.parameters, *model.noise]
@@ -79,11 +82,11 @@ def sent(looks, *, earth="flat", apertures=3, off=(0.0, 0.0, 0.0), rows="shift",
     values |= {n: 1.0 for n in names if n.endswith("_time")} | told
     values["prior.v_e_at_aperture"] = values["v_e"] = np.array([70.0, 0.0, 0.0])
     found = []
-    for k in range(1, 2 * apertures + 1):
+    for k in range(1, every * apertures + 1):
         t = k / 2
         values["r_e"] = np.array([70.0 * t, 0.0, -1000.0])
-        values["center.fresh"] = float(k % 2)
-        if k % 2:
+        values["center.fresh"] = float(k % every == 1)
+        if k % every == 1:
             values["prior.r_e_at_aperture"] = values["r_e"] + off
         results = [r.full() for r in step(*(values[n] for n in names), 0.5, t)]
         out = dict(zip(model.outputs, results, strict=False))
@@ -103,6 +106,11 @@ def test_points_lie_abeam_on_the_side_that_is_looked_to(looks):
         assert fix["y"] == pytest.approx([np.hypot(1200, 1000), 0.0, 0.0], abs=1e-9)
         assert fix["t_center"] == pytest.approx(k + 0.5)
         assert fix["present"].tolist() == [1, 1, 0]
+
+
+def test_an_aperture_is_measured_once():
+    """Also where the radar steps more often than at centers and ends."""
+    assert [fix["t_center"][0] for fix in sent("right", every=4)] == [0.5, 2.5, 4.5]
 
 
 def test_a_navigator_that_is_off_sees_it_in_the_fix():
