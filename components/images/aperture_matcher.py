@@ -38,6 +38,7 @@ from terrafix.models.images.aperture_matching import (
     matched_aperture,
     pixel_steps,
     search_reach,
+    track_offset,
 )
 from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import Dem
@@ -122,7 +123,7 @@ class ApertureMatcher(OnGround):
             self.reason[m] = REASONS.index(found[m].reason)
             self.quality[m] = found[m].quality
             self.residual[m] = found[m].residual
-            self.offset[m] = _explained(grids[m], found[m])
+            self.offset[m] = track_offset(grids[m], found[m])
         self._publish(t, grids, {m: fix for m, fix in found.items() if fix.accepted})
 
     def _matched(self, m: int, own: PixelGrid, reference: Reference, dem: Dem) -> ApertureFix:
@@ -273,13 +274,3 @@ class _Rows:
 
     def __getattr__(self, name: str) -> FloatArray:
         return np.asarray(getattr(self._bundle, name)[self._who])
-
-
-def _explained(own: PixelGrid, fix: ApertureFix) -> FloatArray:
-    """What the track is off by (3,) [m], in the plane of track and sight; NaN without a fix."""
-    if not fix.accepted:
-        return np.full(3, np.nan)
-    sight = fix.place - own.line.r
-    axes = np.stack([sight / np.linalg.norm(sight), -own.line.along])
-    missing = -fix.residual
-    return np.asarray(axes.T @ np.linalg.solve(axes @ axes.T, missing))
