@@ -36,7 +36,7 @@ from terrafix.models.radar.aperture import (
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.compensation import straight_line
 from terrafix.models.radar.scene import Scene
-from terrafix.models.sensors.aperture import LOOKS
+from terrafix.models.sensors.aperture import LOOKS, side_of
 
 _CLOSE = 1e-6
 _LOST = 1, 2
@@ -130,9 +130,6 @@ class AircraftRadar(OnGround):
         values = (self.squint, self.depression, self.elevation_beamwidth)
         return Antenna(float(self.beamwidth[0]), side, *(float(v[0]) for v in values))
 
-    def _side(self, index: int) -> int:
-        return {"right": 1, "left": -1}.get(self.looks, 1 - 2 * (index % 2))
-
     def _step_impl(self, t: float, dt: float) -> None:
         fresh = self.center.fresh & self.environment.active
         if not (self.on and fresh.any()):
@@ -144,7 +141,7 @@ class AircraftRadar(OnGround):
         first: ValueError | None = None
         for m in map(int, np.flatnonzero(fresh)):
             try:
-                antenna = self._antenna(self._side(int(self.center.index[m])))
+                antenna = self._antenna(side_of(self.looks, int(self.center.index[m])))
                 echo = self._echo(m, antenna, scene)
             except ValueError as error:
                 first = first or error
