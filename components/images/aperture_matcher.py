@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from terrafix.components.fields import APERTURE_IMAGE, MOTION, SHIFT_FIX, XYZ
@@ -90,9 +92,10 @@ class ApertureMatcher(OnReference, OnGround):
         fresh = self.image.fresh & self.environment.active
         if not fresh.any():
             return
+        self._require_earth(np.where(fresh[:, None], self.image.r_e, np.nan))
         reference, dem, ground = self._reference(), self._dem(), self._ground
         who = [int(m) for m in np.flatnonzero(fresh)]
-        grids = {m: self._grid(m, ground) for m in who}
+        grids = {m: pixel_grid(self.image, m, ground) for m in who}
         if not self._begun:
             self._require_maps(reference, dem, grids)
         self._begun = True
@@ -160,19 +163,6 @@ class ApertureMatcher(OnReference, OnGround):
     def _shape(self, m: int) -> tuple[int, int]:
         return int(self.image.rows[m]), int(self.image.columns[m])
 
-    def _grid(self, m: int, ground: Ground) -> PixelGrid:
-        got = self.image
-        return PixelGrid(
-            float(got.first_time[m]),
-            float(got.row_time[m]),
-            float(got.near_range[m]),
-            float(got.spacing[m]),
-            float(got.velocity[m]),
-            StraightLine(float(got.t[m]), got.r_e[m].copy(), got.v_e[m].copy()),
-            ground,
-            int(got.side[m]),
-        )
-
     def _require_maps(self, reference: Reference, dem: Dem, grids: dict[int, PixelGrid]) -> None:
         """Raise where a reference, or the heights, can be of no use to any of the first images."""
         first: ConfigurationError | None = None
@@ -233,6 +223,20 @@ class ApertureMatcher(OnReference, OnGround):
                 f"m on the ground, those of its images {image[0]:.2f} m along the track by "
                 f"{image[1]:.2f} m of range\n  use a reference of about the same resolution"
             )
+
+
+def pixel_grid(image: Any, m: int, ground: Ground) -> PixelGrid:
+    """Where the pixels of a member's image lie, from a message with `APERTURE_IMAGE`."""
+    return PixelGrid(
+        float(image.first_time[m]),
+        float(image.row_time[m]),
+        float(image.near_range[m]),
+        float(image.spacing[m]),
+        float(image.velocity[m]),
+        StraightLine(float(image.t[m]), image.r_e[m].copy(), image.v_e[m].copy()),
+        ground,
+        int(image.side[m]),
+    )
 
 
 class _Rows:

@@ -198,6 +198,7 @@ class EarlierFlight(_Reference, OnGround):
                 *("r_e", "v_e", "displacement", "near_range", "length", "resolution", "snr"),
             )
         )
+        self._require_earth(self.r_e)
         speed, ground = float(np.linalg.norm(v)), self._ground
         ahead, down = v / speed, ground.axes(r)[2]
         right = np.cross(down, ahead)
