@@ -36,7 +36,6 @@ from terrafix.models.motion.sampled import SampledArc
 from terrafix.models.radar.chirp import (
     SPEED_OF_LIGHT,
     Radar,
-    Window,
     chirp_replica,
     compression_filter,
     padded_length,
@@ -316,7 +315,6 @@ def pulse_echo(
     rng: np.random.Generator,
     *,
     snr_db: float | None = 10.0,
-    window: Window = "boxcar",
 ) -> ComplexArray:
     """Echo of scatterers, compressed in range.
 
@@ -332,8 +330,6 @@ def pulse_echo(
         Of noise.
     snr_db : float, optional
         Ratio of mean clutter to thermal noise in a focused image [dB]; no noise without.
-    window : str or tuple
-        Weighting of the pulse against sidelobes.
 
     Returns
     -------
@@ -347,11 +343,12 @@ def pulse_echo(
             sums.add_impulses(fine, *_about_the_middle(some, aperture, fine.shape[1]))
     cycles = fft.fftfreq(n_fft) / _FINER
     shares = np.sinc(cycles) ** 2
-    pulse = fft.fft(chirp_replica(radar), n_fft) * compression_filter(radar, n_fft, window)
+    compression = compression_filter(radar, n_fft)
+    pulse = fft.fft(chirp_replica(radar), n_fft) * compression
     gain = (pulse / shares).astype(np.complex64)
     low, high = -(-n_fft // 2), n_fft // 2
     sigma = 0.0 if snr_db is None else np.sqrt(n_pulses * 10 ** (-snr_db / 10) / 2)
-    noise_gain = np.sqrt(radar.n_pulse) * compression_filter(radar, n_fft, window)
+    noise_gain = np.sqrt(radar.n_pulse) * compression
     out = np.empty((n_pulses, aperture.n_cells), np.complex64)
     rows = batches(n_pulses, 64)
 
