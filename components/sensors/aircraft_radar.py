@@ -25,16 +25,10 @@ from terrafix.cosim.declare.ports import (
     WindowInput,
 )
 from terrafix.models.core.arrays import ComplexArray
-from terrafix.models.radar.aperture import (
-    FEWEST,
-    Antenna,
-    Aperture,
-    LitGround,
-    flown_aperture,
-    pulse_echo,
-    require_lit,
-)
+from terrafix.models.radar.aperture import Antenna, Aperture, flown_aperture, require_lit
 from terrafix.models.radar.compensation import straight_line
+from terrafix.models.radar.lit_ground import FEWEST, LitGround
+from terrafix.models.radar.pulse_echo import pulse_echo
 from terrafix.models.radar.scene import Scene
 from terrafix.models.sensors.aperture import LOOKS, side_of
 

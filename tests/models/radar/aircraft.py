@@ -12,10 +12,12 @@ from terrafix.models.geometry.ground import FlatGround
 from terrafix.models.images.reference import earlier_pass
 from terrafix.models.maps.dem import Dem, flat_dem
 from terrafix.models.motion.sampled import SampledArc
-from terrafix.models.radar.aperture import Aperture, LitGround, pulse_echo, scatterers_at
+from terrafix.models.radar.aperture import Aperture
 from terrafix.models.radar.aperture_image import aperture_echo
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.footprint import Footprint
+from terrafix.models.radar.lit_ground import LitGround, scatterers_at
+from terrafix.models.radar.pulse_echo import pulse_echo
 from terrafix.models.radar.scene import Scene
 
 RADAR = Radar(9.6e9, 600.0, 240e6, 100e12, 2e-6, 400.0)

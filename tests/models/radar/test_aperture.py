@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from terrafix.models.radar.aperture import (
-    Antenna,
-    LitGround,
-    flown_aperture,
-    pulse_echo,
-    require_lit,
-)
+from terrafix.models.radar.aperture import Antenna, flown_aperture, require_lit
 from terrafix.models.radar.aperture_image import aperture_image
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT, range_compressed
+from terrafix.models.radar.lit_ground import LitGround
+from terrafix.models.radar.pulse_echo import pulse_echo
 from terrafix.models.radar.scene import brightness
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.models.radar import aperture
+from terrafix.models.radar import lit_ground
 from terrafix.models.radar.aperture_image import aperture_image
 from terrafix.models.radar.map_drift import map_drift
 
@@ -82,7 +82,7 @@ def test_a_field_without_features_is_refused(aircraft, field_echo, own):
 
 def test_with_two_scatterers_in_a_cell_a_field_is_not_featureless(aircraft, own, monkeypatch):
     """The trap of simulation: map drift "works" where there is nothing to see."""
-    monkeypatch.setattr(aperture, "FEWEST", 1.0)
+    monkeypatch.setattr(lit_ground, "FEWEST", 1.0)
     echo = aircraft.echo_of(aircraft.FIELD, aircraft.aperture(*own), 3, points=False, per_cell=1.5)
     drift, _ = found(aircraft, echo, own, 0.5)
     assert drift.accepted
