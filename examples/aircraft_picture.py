@@ -65,7 +65,8 @@ class Page(tf.Component):
 
 def with_page(settings) -> tf.System:
     """The system of the example, and a page of its first image."""
-    system = tf.read_system(SYSTEM, [*LOST, *settings])
+    shown = ("former.show_unfocused", "true")
+    system = tf.read_system(SYSTEM, [*LOST, shown, *settings])
     system.add(Page(), "page")
     for source in ("former.images", "former.unfocused", "former.image", "matcher.offset"):
         system.connect(source, f"page.{source.split('.')[1]}")
