@@ -24,9 +24,10 @@ import numpy as np
 from scipy import fft
 
 from terrafix.models.images.aperture_matching import matched_aperture
-from terrafix.models.radar.aperture import LitGround, pulse_echo
 from terrafix.models.radar.aperture_image import aperture_image
+from terrafix.models.radar.lit_ground import LitGround
 from terrafix.models.radar.map_drift import map_drift
+from terrafix.models.radar.pulse_echo import pulse_echo
 from terrafix.models.radar.pulses import ArraySums
 
 HELPER = Path(__file__).parents[1] / "tests" / "models" / "radar" / "aircraft.py"

@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.components.sensors.pulses import pulse_sums
-from terrafix.models.core.arrays import FloatArray, Single
-from terrafix.models.images.aperture_matching import GATE, PARTS
+from terrafix.models.core.arrays import Single
+from terrafix.models.images.aperture_matching import recognized
 from terrafix.models.radar.compensation import straight_line
-from terrafix.models.radar.correlation import Shift, contrast, shift_between
+from terrafix.models.radar.correlation import contrast, shift_between
 from terrafix.models.radar.phase_history import (
     compressed_pulses,
     ground_grid,
@@ -43,10 +43,6 @@ KINDS = {
 """Standard deviations of position [m] and velocity [m/s], each axis, and along the track more."""
 
 
-def accepted(shift: Shift) -> bool:
-    return shift.inside and shift.quality >= GATE and shift.parts >= PARTS
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=20)
@@ -59,9 +55,7 @@ def main() -> None:
     grid = ground_grid(flown.r, SPACING, 440, 440)
     wide = projected(compressed_pulses(other), grid.grown(*REACH), sums)
     reference: Single = contrast(wide)
-    way = np.linalg.norm(np.diff(flown.r, axis=0), axis=1)
-    t: FloatArray = np.concatenate([[0.0], np.cumsum(way)]) / SPEED
-    t -= t.mean()
+    t = flown.times(SPEED)
     true, pulses = straight_line(t, flown.r), compressed_pulses(flown)
     right = wrong = mirrored = 0
     for name, (position, velocity, along) in KINDS.items():
@@ -78,13 +72,13 @@ def main() -> None:
             range_error = np.linalg.norm(at - now.r) - np.linalg.norm(true.r)
             along_error = (now.v @ (at - now.r) + true.v @ true.r) / speed
             good = abs(range_error) < 0.5 and abs(along_error) < 1.0
-            right += accepted(shift) and good
-            wrong += accepted(shift) and not good
-            if accepted(shift) and good:
+            right += recognized(shift) and good
+            wrong += recognized(shift) and not good
+            if recognized(shift) and good:
                 found = drift.velocity - true.speed if drift.accepted else np.nan
                 errors.append((range_error, along_error, found))
             flipped = np.ascontiguousarray(image[::-1, ::-1])
-            mirrored += accepted(shift_between(flipped, reference, REACH))
+            mirrored += recognized(shift_between(flipped, reference, REACH))
         rms = np.sqrt(np.nanmean(np.square(errors), axis=0))
         refused = int(np.isnan(errors).any(axis=1).sum())
         print(

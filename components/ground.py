@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from terrafix.components.shared import shared_setting
+from terrafix.components.shared import require_earth, shared_setting
+from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.models.geometry.ground import EllipsoidGround, FlatGround, Ground, seen_on_terrain
@@ -30,6 +31,10 @@ class OnGround(Component):
     def takes(self, name: str) -> bool:
         """Whether a setting has any effect: an origin has on a flat Earth alone."""
         return super().takes(name) and (name not in ORIGIN or self.setting("earth") == "flat")
+
+    def _require_earth(self, r_e: FloatArray) -> None:
+        """Raise ConfigurationError if positions (n_members, 3) [m] are of the other Earth."""
+        require_earth(self, self.setting("earth"), r_e)
 
     @property
     def _ground(self) -> Ground:

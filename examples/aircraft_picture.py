@@ -15,11 +15,10 @@ from matplotlib.patches import Polygon
 
 import terrafix as tf
 from terrafix.components.fields import APERTURE_IMAGE, GRID, HEIGHT, PLACES, TIES
+from terrafix.components.images.aperture_matcher import pixel_grid
+from terrafix.components.images.reference import reference_from
 from terrafix.models.geometry.ground import FlatGround
-from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import dem_from
-from terrafix.models.radar.aperture_image import PixelGrid
-from terrafix.models.radar.compensation import StraightLine
 
 SYSTEM = Path(__file__).parent / "aircraft_sar.toml"
 LOST = [
@@ -52,33 +51,22 @@ class Page(tf.Component):
 
     def _step_impl(self, t: float, dt: float) -> None:
         if self.seen is None and self.image.fresh[0]:
-            got = {name: np.array(getattr(self.image, name)[0]) for name in APERTURE_IMAGE}
-            line = StraightLine(float(self.image.t[0]), got["r_e"], got["v_e"])
-            names = ("first_time", "row_time", "near_range", "spacing", "velocity")
-            pixels = PixelGrid(
-                *(float(got[n]) for n in names), line, FlatGround(), int(got["side"])
-            )
-            places = np.moveaxis(np.array(self.places), -1, 0)
-            reference = Reference(
-                np.array(self.amplitude),
-                np.array(self.tie_rows),
-                np.array(self.tie_columns),
-                *places,
-            )
+            ports = (self.amplitude, self.tie_rows, self.tie_columns, self.places)
             self.seen = {
-                "pixels": pixels,
-                "focused": np.array(self.images[int(got["index"])]),
+                "pixels": pixel_grid(self.image, 0, FlatGround()),
+                "focused": np.array(self.images[int(self.image.index[0])]),
                 "unfocused": np.array(self.unfocused),
-                "reference": reference,
+                "reference": reference_from(*map(np.array, ports)),
                 "offset": np.array(self.offset[0]),
-                "drift": float(got["drift"]),
+                "drift": float(self.image.drift[0]),
                 "dem": dem_from(np.array(self.height), np.array(self.grid)),
             }
 
 
 def with_page(settings) -> tf.System:
     """The system of the example, and a page of its first image."""
-    system = tf.read_system(SYSTEM, [*LOST, *settings])
+    shown = ("former.show_unfocused", "true")
+    system = tf.read_system(SYSTEM, [*LOST, shown, *settings])
     system.add(Page(), "page")
     for source in ("former.images", "former.unfocused", "former.image", "matcher.offset"):
         system.connect(source, f"page.{source.split('.')[1]}")

@@ -90,11 +90,12 @@ class ApertureFormer(OnGround):
         fresh = self.received.fresh & self.environment.active
         if not fresh.any():
             return
+        self._require_earth(self.r_e.samples[:, -1])
         dem = dem_from(self.height, self.grid)
         chips: list[Single] = []
         values = {n: np.zeros((self.n_members, *f.fixed_shape)) for n, f in APERTURE_IMAGE.items()}
         valid = np.zeros(self.n_members, np.bool_)
-        first: ValueError | None = None
+        broken: dict[int, ValueError] = {}
         for m in map(int, np.flatnonzero(fresh)):
             try:
                 seen = self._echo(m, dem)
@@ -103,18 +104,18 @@ class ApertureFormer(OnGround):
                 if self.show_unfocused and not chips:
                     self.unfocused = aperture_image(seen).amplitude()
             except ValueError as error:
-                first = first or error
-                alone = np.arange(self.n_members) == m
-                if fresh.sum() > 1:
-                    self.fail(alone, f"no image can be formed: {error}")
+                broken[m] = error
                 continue
             valid[m] = True
             values["index"][m] = len(chips)
             chips.append(image.amplitude())
             self._note(values, m, image, drift, chips[-1].shape)
+        if self.step_index <= 1 and not valid.any():
+            first = next(iter(broken.values()))
+            raise ConfigurationError(f"'{self.name}' forms no image: {first}") from first
+        for m, why in broken.items():
+            self.fail(np.arange(self.n_members) == m, f"no image can be formed: {why}")
         if not valid.any():
-            if first is not None:
-                raise ConfigurationError(f"'{self.name}' forms no image: {first}") from first
             return
         self.images = _stacked(chips)
         self.image.publish(self.received.t, valid=valid, **values)

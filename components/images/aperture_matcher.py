@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from terrafix.components.fields import (
-    AMPLITUDE,
-    APERTURE_IMAGE,
-    GRID,
-    HEIGHT,
-    MOTION,
-    PLACES,
-    SHIFT_FIX,
-    TIES,
-    XYZ,
-)
+from terrafix.components.fields import APERTURE_IMAGE, MOTION, SHIFT_FIX, XYZ
 from terrafix.components.ground import OnGround
+from terrafix.components.images.reference import OnReference
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -37,9 +30,10 @@ from terrafix.models.images.aperture_matching import (
     matched_aperture,
     pixel_steps,
     search_reach,
+    track_offset,
 )
 from terrafix.models.images.reference import Reference
-from terrafix.models.maps.dem import Dem, dem_from
+from terrafix.models.maps.dem import Dem
 from terrafix.models.radar.aperture_image import PixelGrid
 from terrafix.models.radar.compensation import StraightLine
 from terrafix.models.sensors.aperture import ROWS
@@ -48,7 +42,7 @@ _COARSER = 4.0
 """How many times larger than the image's the reference's pixels may be, or smaller."""
 
 
-class ApertureMatcher(OnGround):
+class ApertureMatcher(OnReference, OnGround):
     """Finds the image on the reference by the estimate's own geometry, and publishes the fix.
 
     Range and cross-range with the covariance that the correlation surface tells, and what map drift
@@ -70,12 +64,6 @@ class ApertureMatcher(OnGround):
     image = MessageInput(fields=APERTURE_IMAGE, doc="which image is a member's, where it lies")
     prior = BundleInput(MOTION, doc="estimate of now and of the center, before the fix")
     f_b = Input((3,), unit="m/s^2", frame="b", default=0.0, doc="mean specific force of the IMU")
-    amplitude = SharedInput(**AMPLITUDE, doc="of the reference")
-    tie_rows = SharedInput(**TIES, doc="rows of the reference's tie points")
-    tie_columns = SharedInput(**TIES, doc="columns of the reference's tie points")
-    places = SharedInput(**PLACES, doc="latitude, longitude, height of the tie points")
-    height = SharedInput(**HEIGHT, doc="heights of the terrain, as they are known")
-    grid = SharedInput(**GRID, doc="where they lie")
 
     fix = MessageOutput(fields=SHIFT_FIX, doc="the fix")
     reason = Output(doc="index into terrafix.models.images.aperture_matching.REASONS")
@@ -104,12 +92,12 @@ class ApertureMatcher(OnGround):
         fresh = self.image.fresh & self.environment.active
         if not fresh.any():
             return
-        reference, dem, ground = self._reference(), dem_from(self.height, self.grid), self._ground
+        self._require_earth(np.where(fresh[:, None], self.image.r_e, np.nan))
+        reference, dem, ground = self._reference(), self._dem(), self._ground
         who = [int(m) for m in np.flatnonzero(fresh)]
-        grids = {m: self._grid(m, ground) for m in who}
+        grids = {m: pixel_grid(self.image, m, ground) for m in who}
         if not self._begun:
-            for m in who:
-                self._require_map(reference, dem, grids[m], self._shape(m))
+            self._require_maps(reference, dem, grids)
         self._begun = True
         found: dict[int, ApertureFix] = {}
         for m in who:
@@ -121,7 +109,7 @@ class ApertureMatcher(OnGround):
             self.reason[m] = REASONS.index(found[m].reason)
             self.quality[m] = found[m].quality
             self.residual[m] = found[m].residual
-            self.offset[m] = _explained(grids[m], found[m])
+            self.offset[m] = track_offset(grids[m], found[m])
         self._publish(t, grids, {m: fix for m, fix in found.items() if fix.accepted})
 
     def _matched(self, m: int, own: PixelGrid, reference: Reference, dem: Dem) -> ApertureFix:
@@ -175,32 +163,18 @@ class ApertureMatcher(OnGround):
     def _shape(self, m: int) -> tuple[int, int]:
         return int(self.image.rows[m]), int(self.image.columns[m])
 
-    def _grid(self, m: int, ground: Ground) -> PixelGrid:
-        got = self.image
-        return PixelGrid(
-            float(got.first_time[m]),
-            float(got.row_time[m]),
-            float(got.near_range[m]),
-            float(got.spacing[m]),
-            float(got.velocity[m]),
-            StraightLine(float(got.t[m]), got.r_e[m].copy(), got.v_e[m].copy()),
-            ground,
-            int(got.side[m]),
-        )
-
-    def _reference(self) -> Reference:
-        places = self.places
-        try:
-            return Reference(
-                self.amplitude,
-                self.tie_rows,
-                self.tie_columns,
-                places[..., 0],
-                places[..., 1],
-                places[..., 2],
-            )
-        except ValueError as error:
-            raise ConfigurationError(f"'{self.name}' cannot use its reference: {error}") from error
+    def _require_maps(self, reference: Reference, dem: Dem, grids: dict[int, PixelGrid]) -> None:
+        """Raise where a reference, or the heights, can be of no use to any of the first images."""
+        first: ConfigurationError | None = None
+        for m, own in grids.items():
+            try:
+                self._require_map(reference, dem, own, self._shape(m))
+            except ConfigurationError as error:
+                first = first or error
+                continue
+            return
+        if first is not None:
+            raise first
 
     def _require_map(
         self, reference: Reference, dem: Dem, own: PixelGrid, shape: tuple[int, int]
@@ -242,26 +216,27 @@ class ApertureMatcher(OnGround):
         raise ConfigurationError(f"the image is not on the reference of '{self.name}': {told}")
 
     def _require_pixels(self, reference: Reference, own: PixelGrid, shape: tuple[int, int]) -> None:
-        i, j = (k // 2 for k in reference.latitude.shape)
-        at = [
-            own.ground.point(a[0], a[1], a[2])
-            for a in (
-                [x[r, c] for x in (reference.latitude, reference.longitude, reference.height)]
-                for r, c in ((i, j), (i - 1, j), (i, j - 1))
-            )
-        ]
-        pixels = (
-            np.linalg.norm(at[1] - at[0]) / (reference.rows[i] - reference.rows[i - 1]),
-            np.linalg.norm(at[2] - at[0]) / (reference.columns[j] - reference.columns[j - 1]),
-        )
-        image = pixel_steps(own, shape)
-        area, wanted = float(pixels[0] * pixels[1]), float(image[0] * image[1])
-        if not 1 / _COARSER**2 < area / wanted < _COARSER**2:
+        pixels, image = reference.pixel_size(own.ground), pixel_steps(own, shape)
+        if not 1 / _COARSER**2 < float(np.prod(pixels) / np.prod(image)) < _COARSER**2:
             raise ConfigurationError(
                 f"pixels of the reference of '{self.name}' are {pixels[0]:.2f} by {pixels[1]:.2f} "
                 f"m on the ground, those of its images {image[0]:.2f} m along the track by "
                 f"{image[1]:.2f} m of range\n  use a reference of about the same resolution"
             )
+
+
+def pixel_grid(image: Any, m: int, ground: Ground) -> PixelGrid:
+    """Where the pixels of a member's image lie, from a message with `APERTURE_IMAGE`."""
+    return PixelGrid(
+        float(image.first_time[m]),
+        float(image.row_time[m]),
+        float(image.near_range[m]),
+        float(image.spacing[m]),
+        float(image.velocity[m]),
+        StraightLine(float(image.t[m]), image.r_e[m].copy(), image.v_e[m].copy()),
+        ground,
+        int(image.side[m]),
+    )
 
 
 class _Rows:
@@ -272,13 +247,3 @@ class _Rows:
 
     def __getattr__(self, name: str) -> FloatArray:
         return np.asarray(getattr(self._bundle, name)[self._who])
-
-
-def _explained(own: PixelGrid, fix: ApertureFix) -> FloatArray:
-    """What the track is off by (3,) [m], in the plane of track and sight; NaN without a fix."""
-    if not fix.accepted:
-        return np.full(3, np.nan)
-    sight = fix.place - own.line.r
-    axes = np.stack([sight / np.linalg.norm(sight), -own.line.along])
-    missing = -fix.residual
-    return np.asarray(axes.T @ np.linalg.solve(axes @ axes.T, missing))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.components.fields import AMPLITUDE, ESTIMATE, FIX, GRID, HEIGHT, IMAGE, PLACES, TIES
+from terrafix.components.fields import ESTIMATE, FIX, IMAGE
+from terrafix.components.images.reference import OnReference
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -22,10 +22,10 @@ from terrafix.models.geometry.geodesy import ecef, geodetic
 from terrafix.models.geometry.geolocation import ground_point, track_axes
 from terrafix.models.images.matching import KINDS, REASONS, Match, Searchable, matched
 from terrafix.models.images.reference import Reference
-from terrafix.models.maps.dem import Dem, dem_from
+from terrafix.models.maps.dem import Dem
 
 
-class ImageMatcher(Component):
+class ImageMatcher(OnReference):
     """Finds the image on the reference, its center's place and height, and publishes the fix.
 
     The fix is that of the open loop: the boresight's tangents are zero by construction, the range
@@ -48,12 +48,6 @@ class ImageMatcher(Component):
     images = SharedInput((None, None, None), dtype=np.float32, doc="amplitudes of the images")
     image = MessageInput(fields=IMAGE, doc="which image is a member's, and what it measures")
     prior = BundleInput(ESTIMATE, doc="estimate before the fix of this instant")
-    amplitude = SharedInput(**AMPLITUDE, doc="of the reference")
-    tie_rows = SharedInput(**TIES, doc="rows of the reference's tie points")
-    tie_columns = SharedInput(**TIES, doc="columns of the reference's tie points")
-    places = SharedInput(**PLACES, doc="latitude, longitude, height of the tie points")
-    height = SharedInput(**HEIGHT, doc="heights of the terrain")
-    grid = SharedInput(**GRID, doc="first point and spacing of the heights")
 
     fix = MessageOutput(fields=FIX, doc="the fix")
     reason = Output(doc="of the last image: index into terrafix.models.images.matching.REASONS")
@@ -66,7 +60,7 @@ class ImageMatcher(Component):
         fresh = self.image.fresh & self.environment.active
         if not fresh.any():
             return
-        reference, dem = self._reference(), self._dem()
+        reference, dem = self._covered_reference(), self._dem()
         searchable = Searchable(reference.amplitude)
         found: dict[tuple[int, float, float], Match] = {}
         places = np.zeros((self.n_members, 3))
@@ -119,22 +113,8 @@ class ImageMatcher(Component):
         latitude, longitude, _ = reference.place(match.row, match.column)
         return float(latitude), float(longitude), float(dem.at(latitude, longitude))
 
-    def _dem(self) -> Dem:
-        return dem_from(self.height, self.grid)
-
-    def _reference(self) -> Reference:
-        places = self.places
-        try:
-            reference = Reference(
-                self.amplitude,
-                self.tie_rows,
-                self.tie_columns,
-                places[..., 0],
-                places[..., 1],
-                places[..., 2],
-            )
-        except ValueError as error:
-            raise ConfigurationError(f"'{self.name}' cannot use its reference: {error}") from error
+    def _covered_reference(self) -> Reference:
+        reference = self._reference()
         dem = self._dem()
         covered = dem.covers(reference.latitude, reference.longitude)
         if not covered.all():

@@ -21,14 +21,16 @@ from terrafix.components.sensors.files import (
 )
 from terrafix.components.shared import common, generator, require_common
 from terrafix.components.truth.terrain import scene_from
+from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Parameter, Text
 from terrafix.cosim.declare.ports import Input, MessageInput, SharedInput, SharedOutput
+from terrafix.models.core.arrays import Single
 from terrafix.models.geometry.geolocation import track_axes
 from terrafix.models.images.reference import Reference, earlier_pass, geocoded, read_reference
-from terrafix.models.maps.dem import dem_from
+from terrafix.models.maps.dem import Dem, dem_from
 from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.motion.sampled import SampledArc
 from terrafix.models.radar.boresight import boresight_on_terrain
@@ -36,7 +38,7 @@ from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.doppler import unwrapped_centroid
 from terrafix.models.radar.footprint import Footprint
 from terrafix.models.radar.imaging import Imager
-from terrafix.models.sensors.aperture import LOOKS
+from terrafix.models.sensors.aperture import LOOKS, side_of
 from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
 _TRACK_STEP = 0.02
@@ -61,6 +63,33 @@ class _Reference(Component):
         self.tie_rows = np.asarray(reference.rows, np.float64)
         self.tie_columns = np.asarray(reference.columns, np.float64)
         self.places = np.stack([reference.latitude, reference.longitude, reference.height], axis=-1)
+
+
+class OnReference(Component):
+    """Base of matchers: the reference and the heights that they read."""
+
+    amplitude = SharedInput(**AMPLITUDE, doc="of the reference")
+    tie_rows = SharedInput(**TIES, doc="rows of the reference's tie points")
+    tie_columns = SharedInput(**TIES, doc="columns of the reference's tie points")
+    places = SharedInput(**PLACES, doc="latitude, longitude, height of the tie points")
+    height = SharedInput(**HEIGHT, doc="heights of the terrain, as they are known")
+    grid = SharedInput(**GRID, doc="first point and spacing of the heights")
+
+    def _reference(self) -> Reference:
+        try:
+            return reference_from(self.amplitude, self.tie_rows, self.tie_columns, self.places)
+        except ValueError as error:
+            raise ConfigurationError(f"'{self.name}' cannot use its reference: {error}") from error
+
+    def _dem(self) -> Dem:
+        return dem_from(self.height, self.grid)
+
+
+def reference_from(
+    amplitude: Single, rows: FloatArray, columns: FloatArray, places: FloatArray
+) -> Reference:
+    """Reference of the ports that publish one."""
+    return Reference(amplitude, rows, columns, *np.moveaxis(places, -1, 0))
 
 
 class EarlierPass(_Reference):
@@ -162,19 +191,19 @@ class EarlierFlight(_Reference, OnGround):
         fresh = self.center.fresh
         if not fresh.any():
             return
-        index = int(self.center.index[np.argmax(fresh)])
-        side = {"right": 1, "left": -1}.get(self.looks, 1 - 2 * (index % 2))
+        side = side_of(self.looks, int(self.center.index[np.argmax(fresh)]))
         r, v, displacement, near, length, resolution, snr = (
             common(self, name)
             for name in (
                 *("r_e", "v_e", "displacement", "near_range", "length", "resolution", "snr"),
             )
         )
+        self._require_earth(self.r_e)
         speed, ground = float(np.linalg.norm(v)), self._ground
         ahead, down = v / speed, ground.axes(r)[2]
         right = np.cross(down, ahead)
         right /= np.linalg.norm(right)
-        r = r + displacement @ np.stack([ahead, right, np.cross(ahead, right) * -1.0])
+        r = r + displacement @ np.stack([ahead, right, np.cross(right, ahead)])
         radar = replace(Radar(*map(float, self.radar)), doppler_bandwidth=float(speed / resolution))
         reach = float(length) / speed
         s = np.arange(-reach, reach + _TRACK_STEP, _TRACK_STEP)

@@ -11,7 +11,8 @@ from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Count, Parameter
 from terrafix.cosim.declare.ports import MessageInput, MessageOutput, SharedInput
-from terrafix.models.images.aperture_matching import GATE, PARTS
+from terrafix.models.core.arrays import Single
+from terrafix.models.images.aperture_matching import recognized
 from terrafix.models.radar.compensation import straight_line
 from terrafix.models.radar.correlation import contrast, shift_between
 from terrafix.models.radar.phase_history import (
@@ -23,6 +24,9 @@ from terrafix.models.radar.phase_history import (
     projected,
     projected_drift,
 )
+from terrafix.models.radar.pulses import Profiles
+
+_HISTORY = ("phase", "frequency", "r", "reference")
 
 
 class SpotlightMatcher(Component):
@@ -60,23 +64,24 @@ class SpotlightMatcher(Component):
         spacing, sums = float(self.spacing[0]), pulse_sums()
         rows, columns = (int(np.ceil(m / spacing)) for m in self.reach[0])
         grid = ground_grid(self.r, spacing, self.size, self.size)
-        other = PhaseHistory(
-            self.other_phase, self.other_frequency, self.other_r, self.other_reference
+        own, other = (
+            PhaseHistory(*(getattr(self, aspect + name) for name in _HISTORY))
+            for aspect in ("", "other_")
         )
+        pulses = compressed_pulses(own)
         wide = contrast(projected(compressed_pulses(other), grid.grown(rows, columns), sums))
         values = {name: np.zeros(self.n_members) for name in SPOTLIGHT_FIX}
         for m in map(int, np.flatnonzero(fresh)):
-            for name, value in self._measured(m, grid, wide, (rows, columns)).items():
+            for name, value in self._measured(m, pulses, grid, wide, (rows, columns)).items():
                 values[name][m] = value
         self.fix.publish(t, valid=fresh, **values)
 
     def _measured(
-        self, m: int, grid: GroundGrid, wide: np.ndarray, reach: tuple[int, int]
+        self, m: int, pulses: Profiles, grid: GroundGrid, wide: Single, reach: tuple[int, int]
     ) -> dict[str, float]:
         t, sums = np.asarray(self.times), pulse_sums()
-        history = PhaseHistory(self.phase, self.frequency, self.r, self.reference)
-        believed = self.r + self.error.position[m] + np.outer(t, self.error.velocity[m])
-        drift, focused = projected_drift(moved(compressed_pulses(history), believed), t, grid, sums)
+        believed = pulses.r + self.error.position[m] + np.outer(t, self.error.velocity[m])
+        drift, focused = projected_drift(moved(pulses, believed), t, grid, sums)
         shift = shift_between(contrast(projected(focused, grid, sums)), wide, reach)
         at = grid.spacing * (shift.pixels[0] * grid.along + shift.pixels[1] * grid.out)
         now, speed = straight_line(t, focused.r), straight_line(t, believed).speed
@@ -86,5 +91,5 @@ class SpotlightMatcher(Component):
             "speed": speed,
             "velocity": drift.velocity,
             "focused": float(drift.accepted),
-            "accepted": float(shift.inside and shift.quality >= GATE and shift.parts >= PARTS),
+            "accepted": float(recognized(shift)),
         }

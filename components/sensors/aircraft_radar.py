@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.components.fields import GRID, HEIGHT, PULSES, RADAR, SURFACE
+from terrafix.components.fields import GRID, HEIGHT, PULSES, SURFACE
 from terrafix.components.ground import OnGround, height_in_swath
 from terrafix.components.sensors.aperture import MARK
+from terrafix.components.sensors.echo import SendsChirps
 from terrafix.components.sensors.pulses import pulse_sums
-from terrafix.components.shared import generator, require_common, shared_setting
+from terrafix.components.shared import generator, shared_setting
 from terrafix.components.truth.terrain import scene_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
@@ -24,26 +25,19 @@ from terrafix.cosim.declare.ports import (
     WindowInput,
 )
 from terrafix.models.core.arrays import ComplexArray
-from terrafix.models.radar.aperture import (
-    FEWEST,
-    Antenna,
-    Aperture,
-    LitGround,
-    flown_aperture,
-    pulse_echo,
-    require_lit,
-)
-from terrafix.models.radar.chirp import Radar
+from terrafix.models.radar.aperture import Antenna, Aperture, flown_aperture, require_lit
 from terrafix.models.radar.compensation import straight_line
+from terrafix.models.radar.lit_ground import FEWEST, LitGround
+from terrafix.models.radar.pulse_echo import pulse_echo
 from terrafix.models.radar.scene import Scene
-from terrafix.models.sensors.aperture import LOOKS
+from terrafix.models.sensors.aperture import LOOKS, side_of
 
 _CLOSE = 1e-6
 _LOST = 1, 2
 """What `lost` says of an aperture without an echo: the beam was off the swath; it cannot be."""
 
 
-class AircraftRadar(OnGround):
+class AircraftRadar(SendsChirps, OnGround):
     """Echo of an aperture, compressed in range, from the track of each member's own truth.
 
     It steps at the ends of apertures and takes what was flown about their centers. Clutter is a new
@@ -55,12 +49,6 @@ class AircraftRadar(OnGround):
 
     on = Flag(True, doc="whether it sends")
     looks = Choice(LOOKS, "right", doc="side that apertures look to")
-    carrier = Parameter(unit="Hz", positive=True, doc="carrier frequency")
-    prf = Parameter(unit="Hz", positive=True, doc="pulse repetition frequency")
-    sample_rate = Parameter(unit="Hz", positive=True, doc="complex samples of a line")
-    chirp_rate = Parameter(unit="Hz/s", doc="sweep of the pulse, negative downward")
-    pulse_length = Parameter(unit="s", positive=True, doc="of the pulse")
-    doppler_bandwidth = Parameter(unit="Hz", positive=True, doc="processed, at most the prf")
     length = Parameter(0.98, unit="s", positive=True, doc="of an aperture")
     near_range = Parameter(unit="m", positive=True, doc="slant range of the first cell")
     n_cells = Count(320, minimum=64, doc="range cells of a line")
@@ -82,7 +70,6 @@ class AircraftRadar(OnGround):
     grid = SharedInput(**GRID, doc="where they lie")
     surface = SharedInput(**SURFACE, doc="texture and points of the surface")
 
-    radar = SharedOutput(**RADAR, doc="what the radar sends and how its echo is sampled")
     echoes = SharedOutput(
         (None, None, None), dtype=np.complex64, doc="of members: pulses, range cells"
     )
@@ -106,19 +93,10 @@ class AircraftRadar(OnGround):
                 f"{float(period):g} s\n  set {self.name}.length to less, or a longer period"
             )
 
-    def _radar(self) -> Radar:
-        values = [shared_setting(self, name) for name in Radar.__dataclass_fields__]
-        try:
-            return Radar(*map(float, values))
-        except ValueError as error:
-            raise ConfigurationError(f"the radar of '{self.name}' cannot be: {error}") from error
-
     def _initialize_impl(self) -> None:
-        require_common(self)
-        radar = self._radar()
-        self.radar = np.array([getattr(radar, name) for name in Radar.__dataclass_fields__])
+        super()._initialize_impl()
         self.lost = 0.0
-        pulses = float(self.length[0]) * radar.prf
+        pulses = float(self.length[0]) * float(self.prf[0])
         require_memory(
             self.name,
             8 * pulses * self.n_cells * (self.n_members + 8),
@@ -130,34 +108,35 @@ class AircraftRadar(OnGround):
         values = (self.squint, self.depression, self.elevation_beamwidth)
         return Antenna(float(self.beamwidth[0]), side, *(float(v[0]) for v in values))
 
-    def _side(self, index: int) -> int:
-        return {"right": 1, "left": -1}.get(self.looks, 1 - 2 * (index % 2))
-
     def _step_impl(self, t: float, dt: float) -> None:
         fresh = self.center.fresh & self.environment.active
         if not (self.on and fresh.any()):
             return
+        self._require_earth(self.r_e.samples[:, -1])
         scene = scene_from(self.height, self.grid, self.surface)
         echoes: list[ComplexArray] = []
         values = {n: np.zeros((self.n_members, *f.fixed_shape)) for n, f in PULSES.items()}
         valid = np.zeros(self.n_members, np.bool_)
-        first: ValueError | None = None
+        refused: dict[int, ValueError] = {}
         for m in map(int, np.flatnonzero(fresh)):
             try:
-                antenna = self._antenna(self._side(int(self.center.index[m])))
+                antenna = self._antenna(side_of(self.looks, int(self.center.index[m])))
                 echo = self._echo(m, antenna, scene)
             except ValueError as error:
-                first = first or error
-                self.lost[m] = _LOST[0 if isinstance(error, _OffSwathError) else 1]
+                refused[m] = error
                 continue
             self.lost[m], valid[m] = 0, True
             values["index"][m] = len(echoes)
             values["side"][m], values["axis_b"][m] = antenna.side, antenna.axis
             echoes.append(echo)
-        if first is not None and self.step_index <= 1 and not valid.any():
+        if self.step_index <= 1 and not valid.any():
+            first = next(iter(refused.values()))
             raise ConfigurationError(f"'{self.name}' receives no echo: {first}") from first
-        broken = fresh & (self.lost == _LOST[1])
-        self.fail(broken, f"no echo can be simulated: {first}")
+        for m, why in refused.items():
+            off = isinstance(why, _OffSwathError)
+            self.lost[m] = _LOST[0 if off else 1]
+            if not off:
+                self.fail(np.arange(self.n_members) == m, f"no echo can be simulated: {why}")
         if not valid.any():
             return
         values["near_range"], values["length"] = self.near_range, self.length

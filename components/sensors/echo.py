@@ -39,10 +39,8 @@ _BEYOND = 5.0
 """Arc beyond all apertures [s]: the corners of the surface that is looked up are seen that late."""
 
 
-class _Echo(Component):
-    """Base of radars: what they are, where they look, and their ports."""
-
-    default_rate = Rate("8.2", offset="8.2")
+class SendsChirps(Component):
+    """Base of radars: what they send, and how their echo is sampled."""
 
     carrier = Parameter(unit="Hz", positive=True, doc="carrier frequency")
     prf = Parameter(unit="Hz", positive=True, doc="pulse repetition frequency")
@@ -50,25 +48,8 @@ class _Echo(Component):
     chirp_rate = Parameter(unit="Hz/s", doc="sweep of the pulse, negative downward")
     pulse_length = Parameter(unit="s", positive=True, doc="of the pulse")
     doppler_bandwidth = Parameter(unit="Hz", positive=True, doc="processed, at most the prf")
-    look = Parameter(
-        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
-    )
-    squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
-
-    r_e = Input((3,), unit="m", frame="e", doc="true position")
-    v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
-    q_be = Input((4,), unit="1", frame="b", doc="true attitude, Earth-fixed to body")
-    q_mu = Input((4,), unit="1", frame="s", doc="true misalignment")
-    height = SharedInput(**HEIGHT, doc="heights of the terrain")
-    grid = SharedInput(**GRID, doc="first point and spacing of the heights")
 
     radar = SharedOutput(**RADAR, doc="what the radar sends and how its echo is sampled")
-    echo = SharedOutput(**ECHO, doc="raw echo, lines first")
-    acquired = MessageOutput(fields=ACQUISITION, doc="when and where the echo was received")
-
-    def validate(self) -> None:
-        """Build the radar."""
-        self._radar()
 
     def _radar(self) -> Radar:
         values = [shared_setting(self, name) for name in Radar.__dataclass_fields__]
@@ -81,6 +62,31 @@ class _Echo(Component):
         require_common(self)
         radar = self._radar()
         self.radar = np.array([getattr(radar, name) for name in Radar.__dataclass_fields__])
+
+
+class _Echo(SendsChirps):
+    """Base of a satellite's radars: where they look, and their ports."""
+
+    default_rate = Rate("8.2", offset="8.2")
+
+    look = Parameter(
+        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+    )
+    squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
+
+    r_e = Input((3,), unit="m", frame="e", doc="true position")
+    v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
+    q_be = Input((4,), unit="1", frame="b", doc="true attitude, Earth-fixed to body")
+    q_mu = Input((4,), unit="1", frame="s", doc="true misalignment")
+    height = SharedInput(**HEIGHT, doc="heights of the terrain")
+    grid = SharedInput(**GRID, doc="first point and spacing of the heights")
+
+    echo = SharedOutput(**ECHO, doc="raw echo, lines first")
+    acquired = MessageOutput(fields=ACQUISITION, doc="when and where the echo was received")
+
+    def validate(self) -> None:
+        """Build the radar."""
+        self._radar()
 
     def _boresight(self) -> Boresight:
         """Where the true boresight meets the terrain now."""

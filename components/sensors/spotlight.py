@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from terrafix.components.fields import PHASE, TRACK_ERROR
 from terrafix.components.sensors.files import recorded_files
 from terrafix.components.shared import require_common, shared_setting
@@ -31,7 +29,7 @@ class RecordedSpotlight(Component):
     frequency = SharedOutput((None,), unit="Hz", doc="of its columns")
     r = SharedOutput((None, 3), unit="m", frame="scene", doc="true places of the antenna")
     reference = SharedOutput((None,), unit="m", doc="ranges to which pulses were compensated")
-    times = SharedOutput((None,), unit="s", doc="of its pulses, from their middle")
+    times = SharedOutput((None,), unit="s", doc="of its pulses, from their mean")
 
     def validate(self) -> None:
         """Read the files."""
@@ -50,10 +48,9 @@ class RecordedSpotlight(Component):
     def _initialize_impl(self) -> None:
         require_common(self)
         history = self._read()
-        way = np.linalg.norm(np.diff(history.r, axis=0), axis=1)
-        t = np.concatenate([[0.0], np.cumsum(way)]) / float(shared_setting(self, "speed"))
         self.phase, self.frequency, self.r = history.phase, history.frequency, history.r
-        self.reference, self.times = history.reference, t - t.mean()
+        self.reference = history.reference
+        self.times = history.times(float(shared_setting(self, "speed")))
 
     def _step_impl(self, t: float, dt: float) -> None:
         """Say nothing more."""

@@ -107,17 +107,19 @@ class Terrain(Component):
 
     def _hills(self) -> Dem:
         """Artificial heights, and an error of them where one is asked for."""
-        parts = []
-        for what in ("relief", "error"):
-            rms, length = (float(shared_setting(self, f"{what}{k}")) for k in ("", "_length"))
-            try:
-                parts.append(rolling_dem(rms, length, self.setting(f"{what}_seed")))
-            except ValueError as error:
-                raise ConfigurationError(
-                    f"'{self.name}' cannot make its hills: {error}\n  set {self.name}.{what}_length"
-                ) from error
-        true, wrong = parts
-        return replace(true, height=true.height + wrong.height)
+        true = self._rolling("relief")
+        if not float(shared_setting(self, "error")):
+            return true
+        return replace(true, height=true.height + self._rolling("error").height)
+
+    def _rolling(self, what: str) -> Dem:
+        rms, length = (float(shared_setting(self, f"{what}{k}")) for k in ("", "_length"))
+        try:
+            return rolling_dem(rms, length, self.setting(f"{what}_seed"))
+        except ValueError as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot make its hills: {error}\n  set {self.name}.{what}_length"
+            ) from error
 
     def takes(self, name: str) -> bool:
         """Whether a setting has any effect: heights of hills have where there are hills."""

@@ -39,6 +39,13 @@ _TINY = 1e-300
 """Added under square roots so that their derivative exists at zero; below every rounding."""
 
 
+def chart_scales(latitude: Any) -> tuple[Any, Any]:
+    """Meters on the ellipsoid for a radian of latitude, and of longitude, at a latitude [rad]."""
+    flatter = 1 - _E2 * ca.sin(latitude) ** 2
+    normal = EARTH.radius / ca.sqrt(flatter)
+    return normal * (1 - _E2) / flatter, normal * ca.cos(latitude)
+
+
 def ecef_from_geodetic(
     latitude: Any,
     longitude: Any,

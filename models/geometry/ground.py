@@ -4,8 +4,11 @@ A ground is a frame in which tracks and places are given, together with the map 
 longitude and height. `EllipsoidGround` is Earth-fixed (WGS-84). `FlatGround` is the flat,
 non-rotating Earth of the aircraft paper: north, east, down of a place, in which
 
-.. math:: n = R (\varphi - \varphi_0), \qquad e = R \cos\varphi_0 (\lambda - \lambda_0),
-          \qquad d = -h .
+.. math:: n = M (\varphi - \varphi_0), \qquad e = N \cos\varphi_0 (\lambda - \lambda_0),
+          \qquad d = -h ,
+
+with the ellipsoid's radii of curvature :math:`M` and :math:`N` at :math:`\varphi_0`, as everywhere
+where a flat Earth is read on a map (`terrafix.models.maps.charts`).
 """
 
 from __future__ import annotations
@@ -17,8 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from terrafix.models.core.arrays import FloatArray
-from terrafix.models.geometry.earth import EARTH
-from terrafix.models.geometry.geodesy import ecef, geodetic, local_axes
+from terrafix.models.geometry.geodesy import chart_scales, ecef, geodetic, local_axes
 from terrafix.models.geometry.geolocation import Height, ground_point
 
 _ROUNDS, _CLOSE = 50, 1e-3
@@ -94,17 +96,23 @@ class FlatGround:
     latitude: float = 0.0
     longitude: float = 0.0
 
+    @property
+    def _scales(self) -> tuple[float, float]:
+        """Meters for a radian of latitude, and of longitude."""
+        north, east = chart_scales(self.latitude)
+        return float(north), float(east)
+
     def geodetic(self, p: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Latitude, longitude [rad] and height [m] of points (..., 3) [m]."""
         n, e, d = np.moveaxis(np.asarray(p, np.float64), -1, 0)
-        parallel = EARTH.radius * np.cos(self.latitude)
-        return self.latitude + n / EARTH.radius, self.longitude + e / parallel, -d
+        north, east = self._scales
+        return self.latitude + n / north, self.longitude + e / east, -d
 
     def point(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> FloatArray:
         """Points (..., 3) [m] at latitudes, longitudes [rad] and heights [m]."""
         latitude, longitude, height = np.broadcast_arrays(latitude, longitude, height)
-        n = EARTH.radius * (latitude - self.latitude)
-        e = EARTH.radius * np.cos(self.latitude) * (longitude - self.longitude)
+        north, east = self._scales
+        n, e = north * (latitude - self.latitude), east * (longitude - self.longitude)
         return np.stack([n, e, -height], axis=-1)
 
     def axes(self, p: ArrayLike) -> FloatArray:

@@ -89,7 +89,7 @@ class ApertureFix:
     covariance : ndarray, shape (2, 2)
         Of both [m^2], from the correlation surface, and `FLOOR`.
     quality : float
-        Height of the peak over the rms of the correlation surface.
+        Height of the lowest peak over the rms of its correlation surface; NaN if none was sought.
     accepted : bool
     reason : str
         Why it was refused; ``"accepted"`` if it was not.
@@ -122,14 +122,17 @@ def search_reach(covariance: ArrayLike, n_sigma: float = 3.0) -> tuple[float, fl
     )
 
 
+def recognized(shift: Shift) -> bool:
+    """Whether a peak stands out, is not on the border, and is held by enough of the image."""
+    return shift.inside and shift.quality >= GATE and shift.parts >= PARTS
+
+
 def matched_aperture(
     amplitude: Single,
     image: PixelGrid,
     reference: Reference,
     terrain: Height,
     reach: tuple[float, float] = NARROWEST,
-    *,
-    gate: float = GATE,
 ) -> ApertureFix:
     """Find where an image lies on a reference, or refuse to say.
 
@@ -144,11 +147,9 @@ def matched_aperture(
         Height [m] at latitudes and longitudes [rad], as the navigator knows it.
     reach : tuple of float
         Along the track and in range [m]: `search_reach`.
-    gate : float
-        Quality that is accepted.
     """
     middle = (amplitude.shape[0] - 1) / 2, (amplitude.shape[1] - 1) / 2
-    offset, quality = np.zeros(3), np.inf
+    offset, quality = np.zeros(3), np.nan
     # what is far off is found with coarse pixels; then twice with fine ones
     searches = [(reach, 1), (NARROWEST, 1)]
     if max(reach) > _COARSE_FROM:
@@ -159,9 +160,9 @@ def matched_aperture(
         if seen < _SEEN:
             return _refused(quality, REASONS[1])
         shift = _shift(amplitude, warped, pixels, coarse)
-        quality = min(quality, shift.quality)
-        if not shift.quality >= gate:
-            return _refused(shift.quality, REASONS[2])
+        quality = float(np.fmin(quality, shift.quality))
+        if not shift.quality >= GATE:
+            return _refused(quality, REASONS[2])
         if not shift.inside:
             return _refused(quality, REASONS[3])
         if not shift.parts >= PARTS:
@@ -256,8 +257,25 @@ def _corrected(
         distance = float(np.linalg.norm(sight))
         axes = np.stack([image.line.along, sight / distance])
         missing = axes @ sight - np.array([float(ahead), float(rho)])
-        offset = offset + axes.T @ np.linalg.solve(axes @ axes.T, missing)
+        offset = offset + _in_plane(axes, missing)
     return offset
+
+
+def track_offset(image: PixelGrid, fix: ApertureFix) -> FloatArray:
+    """What a fix says the track is off by (3,) [m], in the plane of track and sight.
+
+    NaN where it was refused.
+    """
+    if not fix.accepted:
+        return np.full(3, np.nan)
+    sight = fix.place - image.line.r
+    axes = np.stack([sight / np.linalg.norm(sight), -image.line.along])
+    return _in_plane(axes, -fix.residual)
+
+
+def _in_plane(axes: FloatArray, components: FloatArray) -> FloatArray:
+    """Vector (3,) in the plane of two unit vectors (2, 3) that has some components along them."""
+    return np.asarray(axes.T @ np.linalg.solve(axes @ axes.T, components))
 
 
 def _fix(

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from terrafix.models.core.arrays import FloatArray, Single, read_arrays
 from terrafix.models.geometry.geodesy import geodetic
 from terrafix.models.geometry.geolocation import Height, ground_point_on_terrain
-from terrafix.models.geometry.ground import seen_on_terrain
+from terrafix.models.geometry.ground import Ground, seen_on_terrain
 from terrafix.models.motion.sampled import Arc
 from terrafix.models.radar.echo import ideal_image
 from terrafix.models.radar.focusing import Image
@@ -145,6 +145,14 @@ class Reference:
                 break
         inside &= np.abs(change).max(axis=-1) < 0.1
         return pixel[..., 0], pixel[..., 1], inside
+
+    def pixel_size(self, ground: Ground) -> FloatArray:
+        """Lengths of a pixel in the middle from row to row and column to column (2,) [m]."""
+        i, j = (n // 2 for n in self.latitude.shape)
+        at = [i, i - 1, i], [j, j, j - 1]
+        p = ground.point(self.latitude[at], self.longitude[at], self.height[at])
+        pixels = self.rows[i] - self.rows[i - 1], self.columns[j] - self.columns[j - 1]
+        return np.asarray(np.linalg.norm(p[1:] - p[0], axis=1) / pixels)
 
     def own_turn(self, longitude: ArrayLike) -> FloatArray:
         """The same longitudes [rad], within half a turn of the middle of the reference."""

@@ -6,8 +6,8 @@ import numpy as np
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.batch import over_members
-from terrafix.models.geometry.geodesy import geodetic_from_ecef_array
-from terrafix.models.motion.strapdown import EARTHS, chart_scales, level_axes, rotation_rate
+from terrafix.models.geometry.geodesy import chart_scales, geodetic_from_ecef_array
+from terrafix.models.motion.strapdown import EARTHS, level_axes, rotation_rate
 
 ORIGIN = ("latitude0", "longitude0")
 """Where on the ellipsoid a flat Earth has its origin [rad]."""

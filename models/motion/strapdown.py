@@ -62,7 +62,12 @@ from terrafix.models.core.batch import over_members
 from terrafix.models.core.model import Model
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import earth_rate_cross
-from terrafix.models.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef, north_east_down
+from terrafix.models.geometry.geodesy import (
+    chart_scales,
+    ecef_from_geodetic,
+    geodetic_from_ecef,
+    north_east_down,
+)
 from terrafix.models.geometry.quaternion import (
     from_matrix,
     from_rotation_vector,
@@ -352,14 +357,6 @@ def level_view(motion: Motion, earth: str, origin: Any = (0.0, 0.0)) -> dict[str
     C_bn = ca.mtimes(rotation_matrix(motion.q_be), axes.T)
     named = dict(zip(("latitude", "longitude", "height"), place, strict=True))
     return named | {"v_n": ca.mtimes(axes, motion.v_e), "angles": angles_from_matrix(C_bn)}
-
-
-def chart_scales(latitude: Any) -> tuple[Any, Any]:
-    """Meters on the ellipsoid for a radian of latitude, and of longitude, at a latitude [rad]."""
-    e2 = EARTH.flattening * (2 - EARTH.flattening)
-    flatter = 1 - e2 * ca.sin(latitude) ** 2
-    normal = EARTH.radius / ca.sqrt(flatter)
-    return normal * (1 - e2) / flatter, normal * ca.cos(latitude)
 
 
 quaternion_from_angles_array = over_members(quaternion_from_angles, (3,))

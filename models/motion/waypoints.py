@@ -22,9 +22,10 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import quad
 
+from terrafix.models.geometry.geodesy import chart_scales
 from terrafix.models.motion.flight import BLEND, Segment, Start, blend
 from terrafix.models.motion.gravity import STANDARD_GRAVITY
-from terrafix.models.motion.strapdown import chart_scales, rotation_rate
+from terrafix.models.motion.strapdown import rotation_rate
 
 _SHARPEST = radians(150.0)
 _NEAREST = 1.0

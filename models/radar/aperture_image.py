@@ -18,7 +18,7 @@ so that an error :math:`\delta v` (truth less estimate) moves it by
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -79,7 +79,6 @@ def aperture_echo(
     side: int = 1,
     terrain: Height | None = None,
     compensate: bool = True,
-    velocity: FloatArray | None = None,
 ) -> ApertureEcho:
     """Compensate an echo to the navigator's own line, and remove range-cell migration.
 
@@ -109,8 +108,6 @@ def aperture_echo(
         compensated as if the velocity were off by 0.2 m/s.
     compensate : bool
         Whether deviations from the line are compensated; they are for all but a control.
-    velocity : ndarray, shape (3,), optional
-        In place of the line's own: a control.
 
     Raises
     ------
@@ -118,8 +115,6 @@ def aperture_echo(
         If shapes do not fit, or the swath does not reach the ground.
     """
     line = straight_line(t, r)
-    if velocity is not None:
-        line = replace(line, v=velocity)
     mean_axis = axis.mean(axis=0)
     cells = near_range + radar.range_spacing * np.arange(echo.shape[1])
     sine = _beam_sine(ground, line, mean_axis, float(cells.mean()), height, side)

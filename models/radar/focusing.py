@@ -491,9 +491,7 @@ def azimuth_looks(
     ]
 
 
-def time_looks(
-    domain: RangeDoppler, velocity: float, n_looks: int, *, window: Window = "boxcar"
-) -> list[Image]:
+def time_looks(domain: RangeDoppler, velocity: float, n_looks: int) -> list[Image]:
     """Images from disjoint parts of the time of receiving, from its first: independent speckle.
 
     Where an aperture is shorter than the beam, halves of its *Doppler band* show different places
@@ -507,8 +505,6 @@ def time_looks(
         Effective velocity [m/s].
     n_looks : int
         Number of looks, equally long; the lines left over are used by none.
-    window : str or tuple
-        Weighting of the Doppler band.
 
     Raises
     ------
@@ -527,7 +523,7 @@ def time_looks(
         own[k * length : (k + 1) * length] = lines[k * length : (k + 1) * length]
         spectrum = fft.fft(own, axis=0, overwrite_x=True, workers=-1)
         part = replace(domain, spectrum=spectrum.astype(np.complex64, copy=False))
-        images.append(_compressed(part, velocity, band, band, window))
+        images.append(_compressed(part, velocity, band, band, "boxcar"))
     return images
 
 

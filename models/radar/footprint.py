@@ -181,9 +181,8 @@ class _Surface:
         guess = float(scene.dem.at(*ground.geodetic(middle)[:2]))
         above = float(ground.geodetic(footprint.arc.position(np.mean(times)))[2]) - guess
         span = _HIGHEST
-        if (
-            above < 10 * _HIGHEST
-        ):  # near the ground, polynomials of height hold over its relief alone
+        # near the ground, polynomials of height hold over its relief alone
+        if above < 10 * _HIGHEST:
             grid = [np.linspace(a[0], a[1], 33) for a in (times, ranges)]
             p = footprint.points(grid[0][:, None], grid[1][None, :], np.array(guess))
             relief = scene.dem.at(*ground.geodetic(p)[:2]) - guess

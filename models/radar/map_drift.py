@@ -22,8 +22,8 @@ so that (eqs. (15), (16)) :math:`V = \hat V \sqrt{1 + 2 \Delta\eta / T}`, at eve
   .. math:: V_{\mathrm{af}} - \hat V = l^T \delta v - \frac{R}{2 V} u^T \delta a .
 
   Errors are truth less estimate. At 1.5 km and 70 m/s the factor is 11 s, and an accelerometer off
-  by 1 mg looks like 0.11 m/s. `map_drift_row` gives what it measures of velocity, attitude and
-  accelerometer bias.
+  by 1 mg looks like 0.11 m/s. `terrafix.models.sensors.aperture.shift_of` is what a filter
+  expects of it.
 
 References
 ----------
@@ -34,14 +34,14 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from terrafix.models.core.arrays import FloatArray, Single
+from terrafix.models.core.arrays import Single
 from terrafix.models.radar.correlation import Shift, contrast, shift_between
-from terrafix.models.radar.focusing import Image, RangeDoppler, azimuth_looks, time_looks
+from terrafix.models.radar.focusing import RangeDoppler, azimuth_looks, time_looks
 
 GATE = 5.5
 """Height of the peak over the rms of the correlation of two looks, at least."""
@@ -61,7 +61,7 @@ class MapDrift:
     velocity : float
         That focuses the aperture [m/s]; where refused, that of the start.
     sigma : float
-        Standard error that the parts of the image agree on [m/s].
+        Its standard error, from the correlation surface [m/s].
     quality : float
         Height of the last peak over the rms of its correlation surface.
     n_rounds : int
@@ -75,12 +75,71 @@ class MapDrift:
     accepted: bool
 
 
+@dataclass(frozen=True)
+class Looks:
+    """Two images of the same pixels, from two parts of an aperture.
+
+    Parameters
+    ----------
+    first, second : ndarray of float32, shape (n_rows, n_columns)
+        Amplitudes; rows go along the track.
+    row_time : float
+        Time of flight between rows [s].
+    apart : float
+        Between the middles of both parts [s].
+    """
+
+    first: Single
+    second: Single
+    row_time: float
+    apart: float
+
+
+def drifted(
+    looks_at: Callable[[float], Looks], start: float, largest: float, rounds: int = ROUNDS
+) -> MapDrift:
+    """Change a velocity until two looks formed with it show the same.
+
+    Parameters
+    ----------
+    looks_at : callable
+        Looks of a velocity [m/s].
+    start : float
+        Velocity that the navigator believes [m/s].
+    largest : float
+        Largest change that is looked for [m/s].
+    rounds : int
+        Of forming both looks, at most.
+    """
+    own = start
+    for k in range(1, rounds + 1):
+        looks = looks_at(own)
+        shift = _shift(looks, (largest + abs(own - start)) / own)
+        if not (shift.inside and shift.quality >= GATE):
+            return MapDrift(start, np.inf, shift.quality, k, False)
+        apart = float(shift.pixels[0]) * looks.row_time / looks.apart
+        sigma = own * np.sqrt(shift.covariance[0, 0]) * looks.row_time / (2 * looks.apart)
+        before, own = own, own * np.sqrt(max(1 + apart, 0.25))
+        if abs(own - before) < _CLOSE:
+            break
+    accepted = bool(abs(own - start) <= largest)
+    return MapDrift(own if accepted else start, sigma, shift.quality, k, accepted)
+
+
+def _shift(looks: Looks, share: float) -> Shift:
+    """Shift of the first look against the second, for velocities off by a share."""
+    one, other = contrast(looks.first), contrast(looks.second)
+    rows = int(np.ceil(2 * share * looks.apart / looks.row_time)) + 4
+    rows = min(rows, one.shape[0] // 4)
+    inner = np.ascontiguousarray(one[rows:-rows, _COLUMNS:-_COLUMNS])
+    return shift_between(inner, other, (rows, _COLUMNS))
+
+
 def map_drift(
     domain: RangeDoppler,
     velocity: float,
     *,
     largest: float = 4.0,
-    gate: float = GATE,
     rounds: int = ROUNDS,
     looks: str = "time",
 ) -> MapDrift:
@@ -94,8 +153,6 @@ def map_drift(
         That the navigator believes [m/s].
     largest : float
         Largest change that is looked for [m/s].
-    gate : float
-        Quality that is accepted.
     rounds : int
         Of forming both looks, at most.
     looks : {"time", "band"}
@@ -108,26 +165,14 @@ def map_drift(
     """
     if looks not in ("time", "band"):
         raise ValueError(f"looks must be halves of 'time' or of the 'band', got '{looks}'")
-    split = time_looks if looks == "time" else azimuth_looks
-    half = (domain.n_lines // 2) / domain.radar.prf
-    own, sigma, k = velocity, np.inf, 0
-    shift = None
-    for k in range(1, rounds + 1):
-        first, second = split(domain, own, 2)
-        shift = _shift(first, second, own, half, largest + abs(own - velocity))
-        if not (shift.inside and shift.quality >= gate):
-            return MapDrift(velocity, np.inf, shift.quality, k, False)
-        apart = float(shift.pixels[0]) / domain.radar.prf
-        if looks == "band":
-            half = _band_time(domain, own)
-        better = own * np.sqrt(max(1 + apart / half, 0.25))
-        sigma = own * np.sqrt(shift.covariance[0, 0]) / domain.radar.prf / (2 * half)
-        change, own = better - own, better
-        if abs(change) < _CLOSE:
-            break
-    quality = shift.quality if shift is not None else 0.0
-    accepted = abs(own - velocity) <= largest
-    return MapDrift(own if accepted else velocity, sigma, quality, k, accepted)
+    prf, half = domain.radar.prf, (domain.n_lines // 2) / domain.radar.prf
+
+    def looks_at(own: float) -> Looks:
+        split = time_looks if looks == "time" else azimuth_looks
+        first, second = (np.abs(image.valid) for image in split(domain, own, 2))
+        return Looks(first, second, 1 / prf, half if looks == "time" else _band_time(domain, own))
+
+    return drifted(looks_at, velocity, largest, rounds)
 
 
 def _band_time(domain: RangeDoppler, velocity: float) -> float:
@@ -135,50 +180,3 @@ def _band_time(domain: RangeDoppler, velocity: float) -> float:
     distance = float(domain.slant_range[domain.columns].mean())
     rate = 2 * velocity**2 / (domain.radar.wavelength * distance)
     return domain.radar.doppler_bandwidth / 2 / rate
-
-
-def _shift(first: Image, second: Image, velocity: float, half: float, largest: float) -> Shift:
-    """Shift of the first look against the second, in lines and cells."""
-    one, other = (contrast(_amplitude(look)) for look in (first, second))
-    rows = int(np.ceil(2 * largest / velocity * half * first.radar.prf)) + 4
-    rows = min(rows, one.shape[0] // 4)
-    inner = np.ascontiguousarray(one[rows:-rows, _COLUMNS:-_COLUMNS])
-    return shift_between(inner, other, (rows, _COLUMNS))
-
-
-def _amplitude(image: Image) -> Single:
-    return np.abs(image.valid)
-
-
-def map_drift_row(
-    velocity: ArrayLike, sight: ArrayLike, force: ArrayLike, attitude: ArrayLike
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    r"""What map drift measures, by errors (truth less estimate) of a navigator.
-
-    .. math::
-        V_{\mathrm{af}} - \hat V = l^T \delta v - \frac{R}{2V} u^T \delta a, \qquad
-        \delta a = [f \times] \delta\theta - C \delta b_a,
-
-    for :math:`C_\mathrm{true} = (I - [\delta\theta \times]) \hat C`.
-
-    Parameters
-    ----------
-    velocity : array_like, shape (..., 3)
-        [m/s]
-    sight : array_like, shape (..., 3)
-        From the antenna to the middle of what is seen [m].
-    force : array_like, shape (..., 3)
-        Specific force [m/s^2], in the frame of velocity and sight.
-    attitude : array_like, shape (..., 3, 3)
-        Body to that frame.
-
-    Returns
-    -------
-    by_velocity, by_attitude, by_bias : ndarray, shape (..., 3)
-    """
-    v, line, f, C = (np.asarray(a, np.float64) for a in (velocity, sight, force, attitude))
-    speed, distance = (np.linalg.norm(a, axis=-1, keepdims=True) for a in (v, line))
-    lever = -(distance / (2 * speed)) * line / distance
-    by_attitude = np.cross(lever, f)
-    by_bias = -np.einsum("...i,...ij->...j", lever, C)
-    return v / speed, by_attitude, by_bias

@@ -25,10 +25,9 @@ from scipy.signal import get_window
 
 from terrafix.models.core.arrays import ComplexArray, FloatArray, Single
 from terrafix.models.core.formats import kind_of
-from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Window
-from terrafix.models.radar.compensation import StraightLine, straight_line
-from terrafix.models.radar.correlation import Shift, contrast, shift_between
-from terrafix.models.radar.map_drift import GATE, ROUNDS, MapDrift
+from terrafix.models.radar.chirp import SPEED_OF_LIGHT
+from terrafix.models.radar.compensation import straight_line
+from terrafix.models.radar.map_drift import Looks, MapDrift, drifted
 from terrafix.models.radar.pulses import Profiles, PulseSums
 
 _FINER = 8
@@ -36,10 +35,8 @@ _FINER = 8
 _FIELDS = ("fp", "freq", "x", "y", "z", "r0")
 _EVEN = 1e-3
 """Steps between frequencies may differ by this share of one."""
-_CLOSE = 2e-3
-"""Change of velocity [m/s] below which another round changes nothing."""
-_ACROSS = 16
-"""Pixels that looks are searched for across the track: no true shift, only the rms."""
+_LARGEST = 4.0
+"""Largest change of velocity that map drift looks for [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -89,11 +86,11 @@ class PhaseHistory:
         """At the middle frequency [m]."""
         return SPEED_OF_LIGHT / float(self.frequency[len(self.frequency) // 2])
 
-    def part(self, pulses: slice) -> PhaseHistory:
-        """Some of the pulses."""
-        return PhaseHistory(
-            self.phase[pulses], self.frequency, self.r[pulses], self.reference[pulses]
-        )
+    def times(self, speed: float) -> FloatArray:
+        """Times (n_pulses,) of the pulses from their mean [s], flown at a speed [m/s]."""
+        way = np.linalg.norm(np.diff(self.r, axis=0), axis=1)
+        t = np.concatenate([[0.0], np.cumsum(way)]) / speed
+        return np.asarray(t - t.mean())
 
 
 def read_gotcha(paths: Sequence[Path]) -> PhaseHistory:
@@ -143,19 +140,12 @@ def _read_gotcha(path: Path) -> PhaseHistory:
         ) from error
 
 
-def compressed_pulses(history: PhaseHistory, window: Window = "hamming") -> Profiles:
-    """Compress pulses in range, about the middle frequency.
-
-    Parameters
-    ----------
-    history : PhaseHistory
-    window : str or tuple
-        Weighting of the band against sidelobes.
-    """
+def compressed_pulses(history: PhaseHistory) -> Profiles:
+    """Compress pulses in range, about the middle frequency, their band weighted (Hamming)."""
     n = len(history.frequency)
     n_fft = int(fft.next_fast_len(_FINER * n))
     step = float(np.diff(history.frequency).mean())
-    weighted = history.phase * get_window(window, n, fftbins=False).astype(np.float32)
+    weighted = history.phase * get_window("hamming", n, fftbins=False).astype(np.float32)
     padded = np.zeros((len(history.phase), n_fft), np.complex64)
     half = n // 2
     padded[:, : n - half] = weighted[:, half:]
@@ -191,13 +181,8 @@ class GroundGrid:
     n_rows: int
     n_columns: int
 
-    def place(self, row: float, column: float) -> FloatArray:
-        """Point (3,) [m] of a pixel; the middle of the grid is the origin."""
-        y, x = row - (self.n_rows - 1) / 2, column - (self.n_columns - 1) / 2
-        return np.asarray(self.spacing * (y * self.along + x * self.out))
-
     def places(self) -> FloatArray:
-        """Points (n_rows * n_columns, 3) [m] of all pixels."""
+        """Points (n_rows * n_columns, 3) [m] of all pixels; the middle is the origin."""
         y = self.spacing * (np.arange(self.n_rows) - (self.n_rows - 1) / 2)
         x = self.spacing * (np.arange(self.n_columns) - (self.n_columns - 1) / 2)
         grid = y[:, None, None] * self.along + x[None, :, None] * self.out
@@ -241,14 +226,7 @@ def moved(profiles: Profiles, r: FloatArray) -> Profiles:
 
 
 def projected_drift(
-    profiles: Profiles,
-    t: FloatArray,
-    grid: GroundGrid,
-    sums: PulseSums,
-    *,
-    largest: float = 4.0,
-    gate: float = GATE,
-    rounds: int = ROUNDS,
+    profiles: Profiles, t: FloatArray, grid: GroundGrid, sums: PulseSums
 ) -> tuple[MapDrift, Profiles]:
     """Map drift by back projection: the velocity that focuses pulses, and their places with it.
 
@@ -260,12 +238,6 @@ def projected_drift(
         Times of the pulses [s].
     grid : GroundGrid
     sums : PulseSums
-    largest : float
-        Largest change of velocity that is looked for [m/s].
-    gate : float
-        Quality that is accepted.
-    rounds : int
-        Of forming both looks, at most.
 
     Raises
     ------
@@ -276,40 +248,17 @@ def projected_drift(
     if n < 2:
         raise ValueError(f"{len(t)} pulses cannot be shared by two looks")
     line = straight_line(t, profiles.r)
-    start = line.speed
     halves = slice(0, n), slice(len(t) - n, len(t))
     apart = float(t[halves[1]].mean() - t[halves[0]].mean())
-    own, sigma, k, now = start, np.inf, 0, profiles
-    quality = 0.0
-    for k in range(1, rounds + 1):
-        shift = _look_shift(now, grid, sums, halves, 2 * (largest + abs(own - start)) * apart)
-        quality = shift.quality
-        if not (shift.inside and quality >= gate):
-            return MapDrift(start, np.inf, quality, k, False), profiles
-        time = float(shift.pixels[0]) * grid.spacing / own
-        change = own * np.sqrt(max(1 + time / apart, 0.25)) - own
-        own += change
-        sigma = float(np.sqrt(shift.covariance[0, 0])) * grid.spacing / (2 * apart)
-        now = moved(profiles, _faster(profiles.r, t, line, own - start))
-        if abs(change) < _CLOSE:
-            break
-    accepted = abs(own - start) <= largest
-    found = MapDrift(own if accepted else start, sigma, quality, k, accepted)
-    return found, now if accepted else profiles
 
+    def flown_at(speed: float) -> Profiles:
+        return moved(
+            profiles, profiles.r + np.outer((speed - line.speed) * (t - line.t), line.along)
+        )
 
-def _faster(r: FloatArray, t: FloatArray, line: StraightLine, change: float) -> FloatArray:
-    return np.asarray(r + np.outer(change * (t - line.t), line.along))
+    def looks_at(speed: float) -> Looks:
+        first, second = (projected(flown_at(speed), grid, sums, half) for half in halves)
+        return Looks(first, second, grid.spacing / speed, apart)
 
-
-def _look_shift(
-    profiles: Profiles,
-    grid: GroundGrid,
-    sums: PulseSums,
-    halves: tuple[slice, slice],
-    largest: float,
-) -> Shift:
-    one, other = (contrast(projected(profiles, grid, sums, half)) for half in halves)
-    rows = min(int(np.ceil(largest / grid.spacing)) + 4, grid.n_rows // 4)
-    inner = np.ascontiguousarray(one[rows:-rows, _ACROSS:-_ACROSS])
-    return shift_between(inner, other, (rows, _ACROSS))
+    found = drifted(looks_at, line.speed, _LARGEST)
+    return found, flown_at(found.velocity) if found.accepted else profiles

@@ -29,6 +29,11 @@ CENTER = "t_center"
 """Field of a fix: the time of its aperture's center [s]."""
 
 
+def side_of(looks: str, index: int) -> int:
+    """Side of an aperture: 1 is right, -1 left."""
+    return {"right": 1, "left": -1}.get(looks, 1 - 2 * (index % 2))
+
+
 def shift_of(d: Any, v: Any, a: Any, speed: Any) -> Any:
     """What an aperture measures about a point, without biases: (3, 1) [m], [m], [m/s].
 

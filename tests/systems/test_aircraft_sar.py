@@ -135,6 +135,14 @@ def test_a_radar_that_is_off_sends_nothing():
 
 TURN = '[{duration = "40 s", turn = "160 deg"}]'
 MISTAKES = {
+    "radar on the other Earth": (
+        [("radar.earth", "wgs84")],
+        "'radar.earth' is wgs84, but the position that it reads is 1 km from the origin",
+    ),
+    "matcher on the other Earth": (
+        [("earth", "wgs84"), ("matcher.earth", "flat")],
+        "'matcher.earth' is flat, but the position that it reads is 6,379 km from the origin",
+    ),
     "repetition frequency that aliases": (
         [("radar.prf", "300 Hz"), ("radar.doppler_bandwidth", "200 Hz")],
         "holds 391 Hz of Doppler at 70.0 m/s, and 300 pulses a second sample less",

@@ -7,14 +7,17 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from terrafix.components.sensors.pulses import pulse_sums
+from terrafix.models.geometry.geodesy import chart_scales
 from terrafix.models.geometry.ground import FlatGround
 from terrafix.models.images.reference import earlier_pass
 from terrafix.models.maps.dem import Dem, flat_dem
 from terrafix.models.motion.sampled import SampledArc
-from terrafix.models.radar.aperture import Aperture, LitGround, pulse_echo, scatterers_at
+from terrafix.models.radar.aperture import Aperture
 from terrafix.models.radar.aperture_image import aperture_echo
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.footprint import Footprint
+from terrafix.models.radar.lit_ground import LitGround, scatterers_at
+from terrafix.models.radar.pulse_echo import pulse_echo
 from terrafix.models.radar.scene import Scene
 
 RADAR = Radar(9.6e9, 600.0, 240e6, 100e12, 2e-6, 400.0)
@@ -27,7 +30,6 @@ SPEED, HEIGHT, RANGE = (
 N_CELLS = 320
 NEAR = RANGE - N_CELLS / 2 * RADAR.range_spacing
 BEAM = np.radians(5.0)
-EARTH = 6378137.0
 
 with warnings.catch_warnings():  # without a compiler NumPy does, and says so
     warnings.simplefilter("ignore")
@@ -39,7 +41,7 @@ def relief(rms=10.0, n=300, step=10.0, length=150.0, seed=3):
     z = gaussian_filter(
         np.random.default_rng(seed).standard_normal((n, n)), length / step / 2, mode="wrap"
     )
-    north, east = step / EARTH, step / EARTH / np.cos(GROUND.latitude)
+    north, east = (step / scale for scale in chart_scales(GROUND.latitude))
     return Dem(
         (z * rms / z.std()).astype(np.float32),
         GROUND.latitude - n / 2 * north,

@@ -79,9 +79,7 @@ def gotcha(aircraft, data_folder):
     flown, other = read_gotcha(files[:2]), read_gotcha(files[2:])
     grid = ground_grid(flown.r, 0.25, 440, 440)
     wide = projected(compressed_pulses(other), grid.grown(*REACH), aircraft.SUMS)
-    way = np.linalg.norm(np.diff(flown.r, axis=0), axis=1)
-    t = np.concatenate([[0.0], np.cumsum(way)]) / SPEED
-    return flown, t - t.mean(), grid, contrast(wide)
+    return flown, flown.times(SPEED), grid, contrast(wide)
 
 
 @pytest.mark.parametrize(
