@@ -66,13 +66,16 @@ def test_a_turned_scene_is_seen_with_north_up():
 
 
 def test_a_turned_frame_is_shown_as_the_first_one(scene):
-    """Turned by 3 degrees and 2 percent finer: back to a code, whose contrast is 30."""
+    """Turned by 3 degrees and 2 percent finer; turned the other way it is off by ten codes.
+
+    Places are rounded to 1/32 pixel, twice, and slopes are up to 25 codes a pixel.
+    """
     c, s = 1.02 * np.cos(np.radians(3.0)), 1.02 * np.sin(np.radians(3.0))
     from_first = np.array([[c, -s], [s, c]])
     smooth = blurred(scene, 2.0)
     turned = frame(smooth, (0.0, 0.0), view=from_first[None] / 100.0)
     back = turned_back(turned, from_first)[8:-8, 8:-8]
-    np.testing.assert_allclose(back, frame(smooth, (0.0, 0.0))[8:-8, 8:-8], rtol=0, atol=1.0)
+    np.testing.assert_allclose(back, frame(smooth, (0.0, 0.0))[8:-8, 8:-8], rtol=0, atol=1.3)
 
 
 def test_frames_beyond_the_scene_are_told():
