@@ -16,6 +16,7 @@ import os
 import resource
 import time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ import terrafix as tf
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT / ".." / "shared" / "data"))
+BAND_4 = DATA / "landsat8" / "LC08_L1TP_224077_20200518_20200518_01_RT_B4.TIF"
 PROFILES = ("non_updated", "image_matched", "image_corrected", "map_matched")
 ORBITS = ("LEO", "MOL")
 PLACE = ("-25.25 deg", "-54.66 deg")
@@ -57,13 +59,12 @@ EFFECTS: dict[str, tuple[tuple[str, str], ...]] = {
 }
 
 
-def fly(file: str, members: int, *settings: tuple[str, str], duration: str | None = None) -> Any:
+def fly(file: str, members: int, *settings: tuple[str, str]) -> Any:
     """Fly a system, print a line for each profile, and return the records."""
     system = tf.read_system(EXAMPLES / file, list(settings))
     system.record("matches", ["matcher.fix", "matcher.reason", "satellite.target"], period="1")
     began, processor = time.perf_counter(), time.process_time()
-    options = {} if duration is None else {"duration": duration}
-    data = tf.simulate(system, members=members, **options).dataset
+    data = tf.simulate(system, members=members).dataset
     took, used = time.perf_counter() - began, time.process_time() - processor
     print(f"{file} {dict(settings)}: {members} members, {took:.1f} s, {used:.1f} s of processors")
     rms = {}
@@ -162,15 +163,16 @@ def others(files: list[str], few: int) -> None:
         for name in ("scene", "place", "grid"):
             for matcher in ("georeference", "map_matcher"):
                 text = text.replace(f"scene.{name} -> {matcher}", f"map.{name} -> {matcher}")
-        path = Path(file).with_name("other_pass.toml")
-        path.write_text(text)
         settings = [("scene.file", str(Path(file).absolute())), ("map_matcher.method", "ncc"), *NCC]
+        settings += [("map.file", str(BAND_4.absolute()))]
         for part in ("scene", "map", "satellite"):
             settings += [(f"{part}.latitude", PLACE[0]), (f"{part}.longitude", PLACE[1])]
         print(f"scene of {Path(file).name}, map of band 4")
-        fly(str(path), few, *settings)
-        fly(str(path), few, *settings, *OTHER_BAND)
-        path.unlink()
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "other_pass.toml"
+            path.write_text(text)
+            fly(str(path), few, *settings)
+            fly(str(path), few, *settings, *OTHER_BAND)
 
 
 def speed() -> None:
@@ -203,7 +205,7 @@ def main() -> None:
         speed()
     if "printed" in wanted:
         printed(options.members)
-    if not (DATA / "landsat8").is_dir():
+    if not BAND_4.is_file():
         print("no Landsat image: the rest is left out (set TERRAFIX_DATA)")
         return
     if "corrected" in wanted:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from terrafix.components.filters.family import (
     FilterCorrect,
     FilterPredict,
@@ -17,7 +15,6 @@ from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import Input, MessageInput, MessageOutput
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
-from terrafix.models.filters.error_state import ErrorState
 from terrafix.models.filters.geolocation import (
     ATTITUDES,
     FIRST_FRAME,
@@ -45,7 +42,6 @@ class _KnownPointing(SymbolicComponent):
     """What is known at t = 0: the nominal orbit, and that the target is in the middle."""
 
     default_rate = Rate(times=["0"])
-    error_state: ClassVar[ErrorState]
 
     geometry = Choice(GEOMETRIES, "wgs84", doc="as of the satellite")
     radius = Parameter(EARTH.radius, unit="m", positive=True, doc="of the sphere")
@@ -62,8 +58,6 @@ class _KnownPointing(SymbolicComponent):
 
 class KnownPointing(_KnownPointing):
     """The nominal orbit, told at t = 0 with the covariance of what follows from it."""
-
-    error_state = TRACKING
 
     first_frame = Choice(
         FIRST_FRAME, "unknown", doc="where the target lies in it: as the filter has it, or measured"
@@ -91,8 +85,6 @@ class KnownPointing(_KnownPointing):
 
 class PrintedKnownPointing(_KnownPointing):
     """The same of the ten printed states."""
-
-    error_state = PRINTED
 
     start = MessageOutput(fields=start_fields(PRINTED, _PRINTED), doc="estimate at t = 0")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 
 from terrafix.components.fields import (
@@ -37,19 +36,23 @@ from terrafix.cosim.declare.ports import (
 )
 from terrafix.models.core.arrays import Single
 from terrafix.models.core.parallel import batches, over
-from terrafix.models.filters.geolocation import FIRST_FRAME
-from terrafix.models.images.frames import (
+from terrafix.models.filters.error_state import ErrorState
+from terrafix.models.filters.geolocation import FIRST_FRAME, PRINTED, TRACKING
+from terrafix.models.images.frame_matching import (
     ALIKE,
     METHODS,
     REASONS,
     FrameMatch,
+    least_squares_shift,
+    match_frame,
+)
+from terrafix.models.images.frames import (
     blurred,
     frame_to_scene,
     inside,
-    least_squares_shift,
-    match_frame,
     sampled,
     shifted,
+    turned_back,
 )
 
 _LOOKS, _STILL, _EDGE = 4, 1e-3, 4
@@ -57,19 +60,15 @@ _LOOKS, _STILL, _EDGE = 4, 1e-3, 4
 from all sides then."""
 _SIGMAS, _MARGIN = 4.0, 2
 """The gate: so many predicted sigmas, and so many pixels besides."""
-_BIAS, _MISMATCH = slice(10, 12), slice(12, 14)
-"""Where they lie in the error of `TRACK`; the target lies at 6, or in `PRINTED_TRACK` at 8."""
-_SQUARE = 1e-6
+_SAME = 1e-6
 """Where two views are the same."""
-_SWAP = np.array([[0.0, -1.0], [1.0, 0.0]])
-"""(row, column) shifts to (north, east): with the signs of `_north_east`."""
 
 
 class _Matching(Component):
     """What matching to the first frame and to a map have in common."""
 
     default_rate = Rate("1")
-    target_at: ClassVar[slice] = slice(6, 8)
+    error_state: ClassVar[ErrorState]
 
     method = Choice(METHODS, "ssd", doc="what is compared; ssd is thrown by a change of light")
     subpixel = Flag(True, doc="go on between whole pixels, by parabolas")
@@ -92,15 +91,22 @@ class _Matching(Component):
     prior: Any
 
     correlation = Output(doc="of the last frame with what it was matched to")
-    reason = Output(doc="of the last match: index into terrafix.models.images.frames.REASONS")
+    reason = Output(
+        doc="of the last match: index into terrafix.models.images.frame_matching.REASONS"
+    )
 
     def takes(self, name: str) -> bool:
         """Whether a setting has any effect."""
         return name != "again" or self.subpixel
 
     def validate(self) -> None:
-        """Look whether the template fits."""
+        """Look whether the template fits, and lies in the middle."""
         template = self.setting("template")
+        if template % 2:
+            raise ConfigurationError(
+                f"'{self.name}.template' is {template} pixels, and a frame has {WINDOW}: an odd "
+                "number has no place in its middle\n  make it even"
+            )
         if template > WINDOW:
             raise ConfigurationError(
                 f"'{self.name}.template' is {template} pixels, larger than the image that it is "
@@ -115,19 +121,7 @@ class _Matching(Component):
         self._match(t)
 
     def _match(self, t: float) -> None:
-        raise NotImplementedError
-
-    def _expected(self, from_first: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What a match to the first frame would give, by the filter, and its sigma: (n, 2) each."""
-        prior = self.prior
-        H = np.zeros((self.n_members, 2, prior.P.shape[1]))
-        H[:, :, self.target_at] = np.eye(2)
-        y = prior.target.copy()
-        if hasattr(prior, "bias"):
-            y += np.einsum("nij,nj->ni", from_first, prior.bias) + prior.mismatch
-            H[:, :, _BIAS], H[:, :, _MISMATCH] = from_first, np.eye(2)
-        variance = np.einsum("nij,njk,nik->ni", H, prior.P, H) + self.match_sigma[:, None] ** 2
-        return y, np.sqrt(np.maximum(variance, 0.0))
+        raise NotImplementedError(f"{type(self).__name__} must provide _match(t)")
 
     def _gate(self, sigma: FloatArray) -> np.ndarray:
         """Half widths of the gate, north and east, whole pixels (n, 2)."""
@@ -234,7 +228,7 @@ class _FrameMatcher(_Matching):
         there = np.where(seen[:, None, None], self.first_view, np.eye(2))
         now = np.where(seen[:, None, None], self.nominal_view, np.eye(2))
         from_first = now @ np.linalg.inv(there)
-        turned = np.abs(from_first - np.eye(2)).max(axis=(1, 2)) > _SQUARE
+        turned = np.abs(from_first - np.eye(2)).max(axis=(1, 2)) > _SAME
         expected, sigma = self._expected(from_first)
         at = np.einsum("nij,nj->ni", from_first, self.at_first)
         if self.first_frame == "georeferenced":
@@ -258,7 +252,7 @@ class _FrameMatcher(_Matching):
                     continue
                 frame = self.frame.value[m]
                 if turned[m]:
-                    frame = _turned(frame, from_first[m])
+                    frame = turned_back(frame, from_first[m])
                 match = self._sought(_cut(frame, size), self.field[m, top:bottom, left:right], m)
                 self._keep(m, match)
                 row, column = match.row, match.column
@@ -268,7 +262,7 @@ class _FrameMatcher(_Matching):
                     and match.reason == 0
                     and match.correlation >= ALIKE
                 ):
-                    row, column = self._again(m, frame, top + up + row, left + side + column)
+                    row, column = self._shown_anew(m, frame, top + up + row, left + side + column)
                     row, column = row - top - up, column - left - side
                 y[m] = whole[m, 0] - row, whole[m, 1] + column
 
@@ -282,7 +276,19 @@ class _FrameMatcher(_Matching):
         self._tell(self.located, t, moved + at, R, from_first, told & (self.referenced > 0.5))
         self._say(seen)
 
-    def _again(self, m: int, frame: Single, row: float, column: float) -> tuple[float, float]:
+    def _expected(self, from_first: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What a match to the first frame would give, by the filter, and its sigma: (n, 2) each."""
+        prior, places = self.prior, self.error_state.places
+        H = np.zeros((self.n_members, 2, self.error_state.size))
+        H[:, :, places["target"]] = np.eye(2)
+        y = prior.target.copy()
+        if "bias" in places:
+            y += np.einsum("nij,nj->ni", from_first, prior.bias) + prior.mismatch
+            H[:, :, places["bias"]], H[:, :, places["mismatch"]] = from_first, np.eye(2)
+        variance = np.einsum("nij,njk,nik->ni", H, prior.P, H) + self.match_sigma[:, None] ** 2
+        return y, np.sqrt(np.maximum(variance, 0.0))
+
+    def _shown_anew(self, m: int, frame: Single, row: float, column: float) -> tuple[float, float]:
         """Corner of a template in the first frame [px], from where it was found."""
         size = min(self.template, WINDOW - 2 * _EDGE)
         edge = (self.template - size) // 2
@@ -300,25 +306,10 @@ class _FrameMatcher(_Matching):
         return row, column
 
 
-def _turned(frame: Single, from_first: FloatArray) -> Single:
-    """A frame as the first one would show it, about its middle."""
-    # from (column, row) there to (column, row) here
-    A = _SWAP.T @ from_first @ _SWAP
-    middle = (frame.shape[0] - 1) / 2
-    shift = middle - A.sum(axis=1) * middle
-    return np.asarray(
-        cv2.warpAffine(
-            frame,
-            np.column_stack([A, shift]),
-            frame.shape,
-            flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REFLECT,
-        )
-    )
-
-
 class _Georeference(_Matching):
     """Frames sought in a map: where the target lies in them. It reads no truth."""
+
+    default_rate = Rate(times=["0"])
 
     blur = Parameter(0.5, unit="px", minimum=0.0, doc="the camera's point spread, as calibrated")
 
@@ -345,7 +336,8 @@ class _Georeference(_Matching):
     def _match(self, t: float) -> None:
         seen = self.frame.fresh & self.environment.active
         target = self.prior.target
-        P = self.prior.P[:, self.target_at, self.target_at]
+        place = self.error_state.places["target"]
+        P = self.prior.P[:, place, place]
         sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
         gate = self._gate(np.hypot(sigma, self.match_sigma[:, None])).max(axis=1)
         y = np.zeros((self.n_members, 2))
@@ -392,26 +384,26 @@ class _Georeference(_Matching):
 class FrameMatcher(_FrameMatcher):
     """Each frame sought in the first one, where the filter expects it."""
 
+    error_state = TRACKING
     prior = BundleInput(TRACK, doc="estimate before the fix of this instant")
 
 
 class PrintedFrameMatcher(_FrameMatcher):
     """The same about an estimate of the ten printed states."""
 
-    target_at = slice(8, 10)
+    error_state = PRINTED
     prior = BundleInput(PRINTED_TRACK, doc="estimate before the fix of this instant")
 
 
 class FrameGeoreference(_Georeference):
     """Frames sought in a map, where the filter expects them; the first one alone, or all."""
 
-    default_rate = Rate(times=["0"])
+    error_state = TRACKING
     prior = BundleInput(TRACK, doc="estimate before the fix of this instant")
 
 
 class PrintedFrameGeoreference(_Georeference):
     """The same about an estimate of the ten printed states."""
 
-    default_rate = Rate(times=["0"])
-    target_at = slice(8, 10)
+    error_state = PRINTED
     prior = BundleInput(PRINTED_TRACK, doc="estimate before the fix of this instant")

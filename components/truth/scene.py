@@ -83,14 +83,16 @@ class GroundScene(Component):
                 f"  set {self.name}.file, or {self.name}.source to synthetic"
             )
         try:
+            stamp = _stamp(path)
+            pixels = _stretched(path, stamp, source)
             if source == "texture":
-                pixels = _stretched(path, _stamp(path), "texture")
                 return pixels, *self._in_its_middle(pixels)
-            pixels = _stretched(path, _stamp(path), "map")
-            return pixels, *self._on_the_map(_read(path, _stamp(path)))
+            return pixels, *self._on_the_map(_read(path, stamp))
         except (OSError, ValueError) as error:
             told = getattr(error, "strerror", None)
             reason = f"'{path}': {told.lower()}" if told else str(error)
+            if isinstance(error, FileNotFoundError):
+                reason += f"\n  set {self.name}.file, or TERRAFIX_DATA to the folder with the data"
             raise ConfigurationError(f"'{self.name}' cannot read its image: {reason}") from error
 
     def _in_its_middle(self, pixels: Single) -> tuple[FloatArray, FloatArray]:
@@ -116,8 +118,6 @@ class GroundScene(Component):
 
 def _stamp(path: Path) -> tuple[int, int]:
     """Time and size of a file, by which it is read again where it has changed."""
-    if not path.is_file():
-        raise FileNotFoundError(2, "No such file; set TERRAFIX_DATA to the folder with the data")
     stat = path.stat()
     return stat.st_mtime_ns, stat.st_size
 
@@ -133,11 +133,11 @@ def _read(path: Path, _: tuple[int, int]) -> GeoImage:
 
 
 @lru_cache(maxsize=2)
-def _stretched(path: Path, stamp: tuple[int, int], kind: str) -> Single:
+def _stretched(path: Path, stamp: tuple[int, int], source: str) -> Single:
     """Codes of the pixels of a file."""
-    pixels = read_texture(path) if kind == "texture" else _read(path, stamp).pixels
+    pixels = read_texture(path) if source == "texture" else _read(path, stamp).pixels
     there = pixels != 0
-    low, middle, high = np.percentile(pixels[there], [2, 50, 98])
+    low, middle, high = np.percentile(pixels[there], [2, 50, 98]) if there.any() else (0, 0, 0)
     if not high > low:
         raise ValueError(f"'{path}' is the same everywhere: it has no texture")
     missing = int((~there).sum())

@@ -40,11 +40,12 @@ from terrafix.models.filters.error_state import ErrorState, vector
 from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.process import Process
 from terrafix.models.geometry.quaternion import rotation_vector
-from terrafix.models.motion.gravity import j2_acceleration
 from terrafix.models.sensors.staring import (
     GEOMETRIES,
+    GRAVITY,
     NORTH_EAST,
-    coasting,
+    coasted,
+    gravity,
     look_parameters,
     target_offset,
 )
@@ -74,19 +75,13 @@ TRACKING = ErrorState(
 _MOVING = ("r", "v", "pitch", "roll")
 """Blocks that the target is a function of."""
 
-GRAVITY = {"mu": 1, "radius": 1, "j2": 1}
-
-
-def _gravity(given: Mapping[str, Any]) -> Any:
-    return lambda r: j2_acceleration(r, given["mu"], given["radius"], given["j2"])
-
 
 def printed_process() -> Process:
     """Gravity and white acceleration; pitch and roll Gauss-Markov; the target a random walk."""
     return Process(
         rates=lambda x, given, noise, _: {
             "r": x["v"],
-            "v": _gravity(given)(x["r"]) + noise["push"],
+            "v": gravity(x["r"], given) + noise["push"],
         },
         noise={"push": ("accel_psd", 3)},
         decays=dict.fromkeys(("pitch", "roll"), ("attitude_time", "attitude_sigma")),
@@ -114,7 +109,7 @@ def tracking_process(geometry: str, attitude: str = "wander") -> Process:
     wander = ("angle_random_walk",) if gyro else ("attitude_time", "attitude_sigma")
 
     def step(x: Mapping[str, Any], given: Mapping[str, Any], dt: Any, _: Any) -> dict[str, Any]:
-        r, v = coasting(_gravity(given))(x["r"], x["v"], dt)
+        r, v = coasted(x["r"], x["v"], given, dt)
         if gyro:
             turned = [x[n] + given["delta_theta_b"][k] for k, n in enumerate(("pitch", "roll"))]
         else:

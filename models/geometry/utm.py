@@ -1,4 +1,4 @@
-r"""Universal Transverse Mercator: places to meters east and north of a zone, and back.
+r"""Universal Transverse Mercator: places to meters east and north of a zone.
 
 The series of Krueger in the third flattening n, to its fourth power,
 

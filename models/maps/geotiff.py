@@ -21,9 +21,6 @@ from terrafix.models.core.arrays import FloatArray, Single
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.utm import SOUTH, utm_from_geodetic
 
-MOST_PIXELS = 2**28
-"""Largest image that is read."""
-
 _SCALE, _TIE, _KEYS = 33550, 33922, 34735
 _MODEL, _GEOGRAPHIC, _PROJECTED = 1024, 2048, 3072
 _POINT, _PIXEL_IS = 2, 1025
@@ -64,23 +61,22 @@ class GeoImage:
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2:
             raise ValueError(f"'{self.name}' is no image of one band: shape {self.pixels.shape}")
-        limit = np.pi if self.zone == 0 else None
-        east = self.west + self.spacing[1] * (self.pixels.shape[1] - 1)
-        if limit is None and self.zone in (1, 60):
-            middle = self.north - self.spacing[0] * self.pixels.shape[0] / 2
-            latitude = middle / EARTH.radius  # to the percent that a border needs
-            side = float(np.pi if self.zone == 60 else -np.pi)
-            border = float(utm_from_geodetic(latitude, side, self.zone)[0])
-            if self.west < border < east:
-                self._refuse_date_line()
-        elif limit is not None and (self.west < -limit or east > limit):
-            self._refuse_date_line()
+        if self._has_date_line():
+            raise ValueError(
+                f"the date line lies inside the map '{self.name}'\n"
+                "  cut it at 180 degrees, and use the part that the target lies in"
+            )
 
-    def _refuse_date_line(self) -> None:
-        raise ValueError(
-            f"the date line lies inside the map '{self.name}'\n"
-            "  cut it at 180 degrees, and use the part that the target lies in"
-        )
+    def _has_date_line(self) -> bool:
+        east = self.west + self.spacing[1] * (self.pixels.shape[1] - 1)
+        if self.zone == 0:
+            return self.west < -np.pi or east > np.pi
+        if self.zone not in (1, 60):
+            return False
+        middle = self.north - self.spacing[0] * self.pixels.shape[0] / 2
+        latitude = middle / EARTH.radius  # to the percent that a border needs
+        border, _ = utm_from_geodetic(latitude, np.pi if self.zone == 60 else -np.pi, self.zone)
+        return self.west < float(border) < east
 
     def pixel(self, latitude: ArrayLike, longitude: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Column and row, fractional, of places [rad], two (...)."""
@@ -157,11 +153,11 @@ def _opened(path: Path) -> tuple[Single, dict[int, Any]]:
         raise FileNotFoundError(f"'{path}': no such file")
     try:
         with Image.open(path) as image:
-            if image.size[0] * image.size[1] > MOST_PIXELS:
-                raise ValueError(f"'{path}' has {image.size[0]} x {image.size[1]} pixels: too many")
             return np.asarray(image, np.float32), dict(getattr(image, "tag_v2", {}))
-    except (UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except UnidentifiedImageError as error:
         raise ValueError(f"'{path}' is no image that can be read (.tif)") from error
+    except Image.DecompressionBombError as error:
+        raise ValueError(f"'{path}' is too large\n  cut out the part about the target") from error
 
 
 def _zone(keys: dict[int, int], path: Path) -> tuple[int, bool]:

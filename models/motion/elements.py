@@ -18,6 +18,7 @@ References
 
 from __future__ import annotations
 
+from dataclasses import fields
 from math import pi
 from typing import Any
 
@@ -25,14 +26,7 @@ import casadi as ca
 
 from terrafix.models.motion.kepler import KeplerianElements
 
-ELEMENTS = (
-    "semi_major_axis",
-    "eccentricity",
-    "inclination",
-    "node",
-    "argument_of_perigee",
-    "true_anomaly",
-)
+ELEMENTS = tuple(field.name for field in fields(KeplerianElements))
 """Names of the elements in their order: [m], [-], and four angles [rad]."""
 
 LOW_ORBIT = KeplerianElements(6.760e6, 0.0323, 1.71, 5.97, 5.46, pi)

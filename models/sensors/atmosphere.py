@@ -54,11 +54,11 @@ TROPOPAUSE, CEILING = 11.0e3, 20.0e3
 """Where the temperature stops falling, and where the thesis lets the atmosphere end [m]."""
 
 
-def hufnagel_valley(h: ArrayLike, wind: float = WIND, ground: float = GROUND) -> FloatArray:
+def hufnagel_valley(h: ArrayLike) -> FloatArray:
     """Structure parameter of the refractive index [m^(-2/3)] at heights [m], shape (...)."""
     h = np.asarray(h, np.float64)
-    high = 0.00594 * (wind / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1000)
-    return np.asarray(high + 2.7e-16 * np.exp(-h / 1500) + ground * np.exp(-h / 100))
+    high = 0.00594 * (WIND / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1000)
+    return np.asarray(high + 2.7e-16 * np.exp(-h / 1500) + GROUND * np.exp(-h / 100))
 
 
 def bufton_wind(

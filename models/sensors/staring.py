@@ -35,7 +35,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from math import pi
 from typing import Any
 
@@ -60,6 +60,9 @@ NADIR = ("sphere", "wgs84")
 
 LOOK = {"sphere": ("pixel", "radius"), "wgs84": ("pixel",), "stars": ("pixel_angle",)}
 """Parameters of each geometry: pixel [m], radius of the Earth [m], angle of a pixel [rad]."""
+
+GRAVITY = {"mu": 1, "radius": 1, "j2": 1}
+"""Parameters of `gravity`: [m^3/s^2], [m], second zonal coefficient; and their sizes."""
 
 PLACE = ("latitude", "longitude", "earth_angle0", "rotation_rate")
 """Parameters of a place that turns with the Earth [rad], [rad/s]."""
@@ -156,17 +159,18 @@ def look_parameters(geometry: str) -> dict[str, int]:
     return dict.fromkeys(LOOK[geometry], 1)
 
 
-def coasting(gravity: Callable[[Any], Any]) -> Callable[[Any, Any, Any], tuple[Any, Any]]:
-    """A step of a free body: from position, velocity (3,) each and a step [s] to both at its end.
+def gravity(r: Any, given: Mapping[str, Any]) -> Any:
+    """Acceleration (3,) [m/s^2] at a position [m], by the parameters that `GRAVITY` names."""
+    return j2_acceleration(r, given["mu"], given["radius"], given["j2"])
 
-    By the classical Runge-Kutta method of order four.
+
+def coasted(r: Any, v: Any, given: Mapping[str, Any], dt: Any) -> tuple[Any, Any]:
+    """Position [m] and velocity [m/s] of a free body after a step [s], (3,) each.
+
+    By the classical Runge-Kutta method of order four, in the `gravity` of what is given.
     """
-
-    def step(r: Any, v: Any, dt: Any) -> tuple[Any, Any]:
-        end = rk4(lambda _, x: ca.vertcat(x[3:6], gravity(x[:3])), ca.vertcat(r, v), dt)
-        return end[:3], end[3:6]
-
-    return step
+    end = rk4(lambda _, x: ca.vertcat(x[3:6], gravity(x[:3], given)), ca.vertcat(r, v), dt)
+    return end[:3], end[3:6]
 
 
 def white_acceleration(psd: Any, dt: Any, first: Any, second: Any) -> tuple[Any, Any]:
@@ -206,10 +210,10 @@ def staring_satellite_model(geometry: str) -> Model:
     """
     if geometry not in GEOMETRIES:
         raise ValueError(f"geometry must be one of {GEOMETRIES}, got '{geometry}'")
-    sizes = {"r": 3, "v": 3, "r_nominal": 3, "v_nominal": 3, "pitch": 1, "roll": 1}
-    sizes["delta_theta_b"] = 3
+    sizes = dict.fromkeys(("r", "v", "r_nominal", "v_nominal"), 3)
+    sizes |= {"pitch": 1, "roll": 1, "delta_theta_b": 3}
     x = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-    names = {*ELEMENTS, "mu", "radius", "j2", "accel_psd", "attitude_sigma", "attitude_time"}
+    names = {*ELEMENTS, *GRAVITY, "accel_psd", "attitude_sigma", "attitude_time"}
     names |= {*LOOK[geometry], *(() if geometry in NADIR else PLACE)}
     p = {name: ca.SX.sym(name) for name in sorted(names)}
     p |= {name: ca.SX.sym(name, 3) for name in ("position_sigma", "velocity_sigma")}
@@ -218,11 +222,10 @@ def staring_satellite_model(geometry: str) -> Model:
         for name, size in (("start", 6), ("push", 6), ("turn", 2), ("turned", 2))
     }
     dt, time = ca.SX.sym("dt"), ca.SX.sym("time")
-    coast = coasting(lambda r: j2_acceleration(r, p["mu"], p["radius"], p["j2"]))
     r0, v0 = state_of_elements([p[name] for name in ELEMENTS], p["mu"])
-    r, v = coast(x["r"], x["v"], dt)
+    r, v = coasted(x["r"], x["v"], p, dt)
     dr, dv = white_acceleration(p["accel_psd"], dt, w["push"][:3], w["push"][3:])
-    nominal = coast(x["r_nominal"], x["v_nominal"], dt)
+    nominal = coasted(x["r_nominal"], x["v_nominal"], p, dt)
     kept = ca.exp(-dt / p["attitude_time"])
     turn = p["attitude_sigma"] * ca.sqrt(1 - kept * kept) * w["turn"]
     off = ca.vertcat(x["pitch"], x["roll"])

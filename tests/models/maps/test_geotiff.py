@@ -71,6 +71,13 @@ def test_a_date_line_inside_the_map_is_refused(tmp_path):
     read_geotiff(written(tmp_path, UTM_60, (800_000.0, 0.0), 30.0))
 
 
+def test_an_image_that_is_too_large_is_refused(tmp_path, monkeypatch):
+    """Of the limit of Pillow, which says that it does not decompress so much."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    with pytest.raises(ValueError, match="is too large\n  cut out the part about the target"):
+        read_geotiff(written(tmp_path, WGS84, (-92.0, 39.5), 1e-3))
+
+
 def test_what_is_no_image_is_refused(tmp_path):
     file = tmp_path / "no.tif"
     file.write_bytes(b"no image")
