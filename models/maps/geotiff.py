@@ -76,7 +76,7 @@ class GeoImage:
         middle = self.north - self.spacing[0] * self.pixels.shape[0] / 2
         latitude = middle / EARTH.radius  # to the percent that a border needs
         border, _ = utm_from_geodetic(latitude, np.pi if self.zone == 60 else -np.pi, self.zone)
-        return self.west < float(border) < east
+        return bool(self.west < float(border) < east)
 
     def pixel(self, latitude: ArrayLike, longitude: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Column and row, fractional, of places [rad], two (...)."""
