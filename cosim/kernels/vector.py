@@ -9,8 +9,8 @@ operations are, ``tile.c`` steps a tile of members, ``stretch.c`` gathers tiles 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable, Iterator
-from functools import cache
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -141,20 +141,17 @@ def _guards(instructions: list[_Instruction]) -> dict[int, int]:
 class _Writer:
     """The lines of the functions that are generated."""
 
-    def __init__(self, kernel: Kernel) -> None:
-        if not kernel.function.is_a("SXFunction"):
-            kind = kernel.function.class_name()
-            raise NoVectorsError(f"it is a {kind}, not made of scalar expressions")
-        self._constant = [a.kind in ("constant", "step") for a in kernel.arguments]
+    def __init__(self, function: Any, kinds: Sequence[str]) -> None:
+        self._constant = [kind in ("constant", "step") for kind in kinds]
         self.prepare: list[str] = []
         self.advance: list[str] = []
-        self.publish: list[list[str]] = [[] for _ in kernel.results]
+        self.publish: list[list[str]] = [[] for _ in range(function.n_out())]
         self.invariants: dict[str, int] = {}
         self.next: dict[str, int] = {}  # different results, in order
         self.used: set[tuple[int, int]] = set()  # elements of arguments
         self._values: dict[int, tuple[str, bool]] = {}  # text, and whether it is invariant
         self._loaded: set[int] = set()
-        instructions = _instructions(kernel.function)
+        instructions = _instructions(function)
         self._guards = _guards(instructions)
         for number, instruction in enumerate(instructions):
             self._write(number, instruction)
@@ -205,8 +202,19 @@ def vector_source(kernel: Kernel) -> tuple[str, int]:
     NoVectorsError
         If the function is not made of scalar instructions that this knows.
     """
-    writer = _Writer(kernel)
-    noise = [i for i, a in enumerate(kernel.arguments) if a.kind == "noise"]
+    if not kernel.function.is_a("SXFunction"):
+        kind = kernel.function.class_name()
+        raise NoVectorsError(f"it is a {kind}, not made of scalar expressions")
+    return _source(kernel.function.serialize(), tuple(a.kind for a in kernel.arguments))
+
+
+@lru_cache(maxsize=128)
+def _source(serialized: str, kinds: tuple[str, ...]) -> tuple[str, int]:
+    """Source of a function whose arguments are of these kinds; simulations ask for it again."""
+    import casadi as ca
+
+    writer = _Writer(ca.Function.deserialize(serialized), kinds)
+    noise = [i for i, kind in enumerate(kinds) if kind == "noise"]
     normals = sorted((i, element) for i, element in writer.used if i in noise)
     pairs = sorted({(i, element // 2) for i, element in normals})
     definitions = {

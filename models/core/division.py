@@ -8,6 +8,7 @@ model, before any code is made of it, so that every kernel and every FMU compute
 from __future__ import annotations
 
 from collections import Counter
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -36,6 +37,13 @@ def sharing_reciprocals(function: Any) -> Any:
     Function
         Of the same name, arguments and results.
     """
+    return _sharing(function.serialize())
+
+
+@lru_cache(maxsize=128)
+def _sharing(serialized: str) -> Any:
+    """Rewrite a function by its text: who assembles a system again asks for the same."""
+    function = ca.Function.deserialize(serialized)
     code = [
         _Instruction(
             function.instruction_id(k),
