@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafix.components.fields import (
     CENTERS,
@@ -25,7 +26,7 @@ from terrafix.cosim.declare.ports import (
     Output,
     SharedInput,
 )
-from terrafix.models.filters.shore import SHORE_REASONS, Shore, match_shore
+from terrafix.models.filters.shore import SHORE_REASONS, Shore, match_shores
 from terrafix.models.images.shore import ELEMENTS, Weights
 
 
@@ -73,14 +74,15 @@ class ShoreMatcher(Optics):
         y, present = np.zeros((n, ELEMENTS)), np.zeros((n, ELEMENTS))
         W = np.zeros((n, ELEMENTS, SHORE_VERTICES, 2))
         good = np.zeros(n, np.bool_)
-        for m in map(int, np.flatnonzero(fresh)):
-            found = self._match(m, int(self.look.lake[m]))
-            if isinstance(found, str):
-                self.reason[m] = SHORE_REASONS.index(found)
-                continue
-            y[m], present[m] = found.value, found.told
-            W[m, :, : found.of_vertices.shape[1]] = found.of_vertices
-            self.reason[m], good[m] = 0, True
+        for lake in np.unique(self.look.lake[fresh]):
+            rows = np.flatnonzero(fresh & (self.look.lake == lake))
+            for m, found in zip(rows, self._match(rows, int(lake)), strict=True):
+                if isinstance(found, str):
+                    self.reason[m] = SHORE_REASONS.index(found)
+                    continue
+                y[m], present[m] = found.value, found.told
+                W[m, :, : found.of_vertices.shape[1]] = found.of_vertices
+                self.reason[m], good[m] = 0, True
         self.fix.publish(
             self.look.t,
             valid=good,
@@ -91,19 +93,22 @@ class ShoreMatcher(Optics):
             present=present,
         )
 
-    def _match(self, m: int, lake: int) -> Weights | str:
+    def _match(self, rows: NDArray[np.int64], lake: int) -> list[Weights | str]:
         begin, end = self.starts[lake : lake + 2]
+        return match_shores(
+            np.concatenate([self.prior.r[rows], self.prior.v[rows]], axis=1),
+            self.prior.P[rows],
+            self.looking(rows) | {"t": self.look.t[rows]},
+            self.vertices[begin:end],
+            self.center[lake],
+            [self._shore(m) for m in rows],
+        )
+
+    def _shore(self, m: int) -> Shore:
+        """Of the lake itself, as a member saw it: rings of islands come after it."""
         rings = self.contour.value[m, : self.contour.count[m]]
         separators = np.flatnonzero(np.isnan(rings[:, 0]))
         contour = rings[: separators[0]] if separators.size else rings
         inside = ((contour > -0.5) & (contour < self.size[m] - 0.5)).all(axis=1)
         sigma = max(float(self.look.sigma[m]), float(self.least_sigma[m]))
-        given = self.looking(np.array([m])) | {"t": self.look.t[m : m + 1]}
-        return match_shore(
-            np.concatenate([self.prior.r[m], self.prior.v[m]]),
-            self.prior.P[m],
-            given,
-            self.vertices[begin:end],
-            self.center[lake],
-            Shore(contour, inside & np.roll(inside, -1), sigma),
-        )
+        return Shore(contour, inside & np.roll(inside, -1), sigma)

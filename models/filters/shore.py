@@ -1,7 +1,7 @@
 r"""The shore of a lake that is seen in part: matched to the catalog, and what that measures.
 
 A contour that leaves the frame has moments of its own; its shore still lies where the catalog's
-does. `match_shore` looks from the prior, follows normals of the predicted outline to the contour
+does. `match_shores` looks from the prior, follows normals of the predicted outline to the contour
 (`terrafix.models.images.shore`), and corrects the prior by Gauss-Newton steps until the
 correspondence of both no longer changes,
 
@@ -16,7 +16,7 @@ estimate, without a search in it, that any rule may iterate.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,44 +105,59 @@ class _Camera:
         return Seen(values, self._given, self._points, self._center)
 
 
-def match_shore(
+def match_shores(
     x0: FloatArray,
     P0: FloatArray,
     given: Mapping[str, FloatArray],
     points: FloatArray,
     center: FloatArray,
-    shore: Shore,
-) -> Weights | str:
-    """Recognize a shore from a prior.
+    shores: Sequence[Shore],
+) -> list[Weights | str]:
+    """Recognize the shore of one lake on what k cameras saw, each from a prior of its own.
 
     Parameters
     ----------
-    x0 : ndarray, shape (6,)
+    x0 : ndarray, shape (k, 6)
         Position [m] and velocity [m/s], inertial.
-    P0 : ndarray, shape (6, 6)
-    given : mapping of str to ndarray, shape (1, size)
+    P0 : ndarray, shape (k, 6, 6)
+    given : mapping of str to ndarray, shape (k, size)
         As `Seen` takes it.
     points : ndarray, shape (K, 3)
         Of the catalog, Earth-fixed [m].
     center : ndarray, shape (3,)
-    shore : Shore
+    shores : sequence of Shore
+        What each saw.
 
     Returns
     -------
-    Weights or str
+    list of Weights or str
         Or which of `SHORE_REASONS` keeps it from being one.
     """
-    look = _Camera(given, points, center)
-    seen = look(x0)
-    if shore.shown.sum() < _LEAST:
-        return "too little shore"
-    if (seen.depth <= 0).any():
-        return "not found"
+    seen = Seen({"r": x0[:, :3], "v": x0[:, 3:]}, given, points, center)
     spread = _spread(seen, P0)
-    if spread.max() < _KNOWN:  # the shores correspond as they are
-        reach = 4 * spread.max() + 4 * shore.sigma + _CATALOG
-        fit = _judged(seen, crossings(seen.pixels[0], shore.contour, shore.shown, reach), shore)
-        return fit if isinstance(fit, str) else fit.match
+    found: list[Weights | str] = []
+    for k, shore in enumerate(shores):
+        if shore.shown.sum() < _LEAST:
+            found.append("too little shore")
+        elif (seen.depth[k] <= 0).any():
+            found.append("not found")
+        elif spread[k].max() < _KNOWN:  # the shores correspond as they are
+            reach = 4 * spread[k].max() + 4 * shore.sigma + _CATALOG
+            outline = seen.pixels[k]
+            near = crossings(outline, shore.contour, shore.shown, reach)
+            fit = _judged(outline, near, shore)
+            found.append(fit if isinstance(fit, str) else fit.match)
+        else:
+            own = {name: values[k : k + 1] for name, values in given.items()}
+            look = _Camera(own, points, center)
+            found.append(_match(look, x0[k], P0[k], spread[k], shore))
+    return found
+
+
+def _match(
+    look: _Camera, x0: FloatArray, P0: FloatArray, spread: FloatArray, shore: Shore
+) -> Weights | str:
+    """Recognize a shore whose outline must be moved first."""
     information: FloatArray = np.linalg.inv(P0).astype(np.float64)
     if spread.max() < _NARROW:
         fit = _fit(look, x0, x0, information, shore, 4 * spread.max() + 4 * shore.sigma)
@@ -151,7 +166,7 @@ def match_shore(
         return "too little shore"
     fits = [
         fit
-        for start in _starts(look, x0, P0, information, shore)
+        for start in _starts(look, x0, P0, spread, information, shore)
         if not isinstance(fit := _fit(look, x0, start, information, shore, _NARROW), str)
     ]
     if not fits:
@@ -165,16 +180,21 @@ def match_shore(
 
 
 def _spread(seen: Seen, P: FloatArray) -> FloatArray:
-    """Standard deviations (2,) of the middle of an outline in the frame [px]."""
-    n = seen.pixels.shape[1]
-    mean = np.zeros((1, 2, n, 2))
-    mean[0, 0, :, 0] = mean[0, 1, :, 1] = 1 / n
-    H = seen.derivative(mean)[0, :, :6]
-    return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", H, P, H)))
+    """Standard deviations (k, 2) of the middle of an outline in the frame [px], of P (k, 6, 6)."""
+    k, n = seen.depth.shape
+    mean = np.zeros((k, 2, n, 2))
+    mean[:, 0, :, 0] = mean[:, 1, :, 1] = 1 / n
+    H = seen.derivative(mean)[..., :6]
+    return np.asarray(np.sqrt(np.sum(H @ P * H, axis=2)))
 
 
 def _starts(
-    look: _Camera, x0: FloatArray, P0: FloatArray, information: FloatArray, shore: Shore
+    look: _Camera,
+    x0: FloatArray,
+    P0: FloatArray,
+    spread: FloatArray,
+    information: FloatArray,
+    shore: Shore,
 ) -> list[FloatArray]:
     """Estimates from which the predicted outline lies near the one that was seen."""
     seen = look(x0)
@@ -185,7 +205,7 @@ def _starts(
     n = max(1, int(np.ceil(np.ptp(outline, axis=0).max() * stretch / _NARROW)))
     scales = np.exp(np.linspace(-1, 1, 2 * n + 1) * np.log1p(stretch))
     points = (shore.contour + np.roll(shore.contour, -1, axis=0))[shore.shown] / 2
-    found = places(outline, points, _REACH * _spread(seen, P0), scales)
+    found = places(outline, points, _REACH * spread, scales)
     middle = outline.mean(axis=0)
     starts = []
     for shift, scale in zip(found.shift, found.scale, strict=True):
@@ -230,7 +250,7 @@ def _fit(
         step = np.linalg.solve(information + H.T @ H, H.T @ residual - information @ (x - x0))
         moved = np.abs(_moved(seen, step)).max()
         if moved < _STILL and reach <= 2 * close:
-            return _judged(seen, found, shore)
+            return _judged(outline, found, shore)
         x = x + step
         reach = max(close, min(reach, 3 * moved + close)) if moved < reach else reach
     return "not found"
@@ -246,9 +266,8 @@ def _moved(seen: Seen, step: FloatArray) -> FloatArray:
     return seen.derivative(by)[0, :, :6] @ step
 
 
-def _judged(seen: Seen, found: Crossings, shore: Shore) -> _Fit | str:
+def _judged(outline: FloatArray, found: Crossings, shore: Shore) -> _Fit | str:
     """A match, if most of the shore that was seen is matched, and closely."""
-    outline = seen.pixels[0]
     if len(found.edge) < _LEAST:
         return "not found"
     cost = float(np.mean(found.distance**2))

@@ -9,7 +9,7 @@ from terrafix.models.filters.shore import (
     ELEMENTS,
     MOST_VERTICES,
     Shore,
-    match_shore,
+    match_shores,
     shore_observation,
 )
 from terrafix.models.geometry.geodesy import ecef
@@ -57,7 +57,11 @@ def matched(points, sigma_r, sigma_v, seed, **kinds):
     sigma = np.repeat([sigma_r, sigma_v], 3)
     prior = TRUE + sigma * rng.normal(size=6)
     seen = shore(points, rng, **kinds)
-    return match_shore(prior, np.diag(sigma**2), GIVEN, points, points.mean(axis=0), seen)
+    return match_one(prior, np.diag(sigma**2), points, seen)
+
+
+def match_one(prior, P, points, seen):
+    return match_shores(prior[None], P[None], GIVEN, points, points.mean(axis=0), [seen])[0]
 
 
 def misfit(points, found):
@@ -87,10 +91,29 @@ def test_what_cannot_be_recognized_says_why(points):
     near = np.concatenate([R + 20e3 * V / np.linalg.norm(V), V])  # 66 px off, and sure of itself
     P = np.diag(np.repeat([30.0, 1.0], 3) ** 2)
     seen = shore(points, np.random.default_rng(1))
-    assert match_shore(near, P, GIVEN, points, points.mean(axis=0), seen) == "not found"
+    assert match_one(near, P, points, seen) == "not found"
     other = Shore(seen.contour[:, ::-1] + [20.0, -60.0], seen.shown, 0.25)  # another lake
     prior = np.diag(np.repeat([15e3, 1.0], 3) ** 2)
-    assert match_shore(TRUE, prior, GIVEN, points, points.mean(axis=0), other) == "not found"
+    assert match_one(TRUE, prior, points, other) == "not found"
+
+
+def test_each_of_many_is_matched_as_it_is_alone(points):
+    """From priors of all kinds, to the same bits; who sees nothing leaves the others alone."""
+    rng = np.random.default_rng(5)
+    sigmas = np.array([[30.0, 1.0], [15e3, 100.0], [30.0, 1.0], [70e3, 100.0], [30.0, 1.0]])
+    sigma = np.repeat(sigmas, 3, axis=1)
+    x0 = TRUE + sigma * rng.normal(size=sigma.shape)
+    P0 = np.stack([np.diag(s**2) for s in sigma])
+    seen = [shore(points, rng) for _ in sigma]
+    seen[2] = Shore(seen[2].contour, np.zeros(len(points), dtype=bool), 0.25)
+    given = {name: np.repeat(value, len(sigma), axis=0) for name, value in GIVEN.items()}
+    together = match_shores(x0, P0, given, points, points.mean(axis=0), seen)
+    for k, found in enumerate(together):
+        alone = match_one(x0[k], P0[k], points, seen[k])
+        if k == 2:
+            assert found == alone == "too little shore"
+        else:
+            assert found.value.tobytes() == alone.value.tobytes()
 
 
 def test_the_derivative_is_that_of_the_prediction(points):
