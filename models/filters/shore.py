@@ -135,23 +135,37 @@ def match_shores(
     """
     seen = Seen({"r": x0[:, :3], "v": x0[:, 3:]}, given, points, center)
     spread = _spread(seen, P0)
-    found: list[Weights | str] = []
+    found: list[Weights | str] = ["not found"] * len(shores)
+    known = []
     for k, shore in enumerate(shores):
         if shore.shown.sum() < _LEAST:
-            found.append("too little shore")
-        elif (seen.depth[k] <= 0).any():
-            found.append("not found")
+            found[k] = "too little shore"
+        elif seen.depth[k].min() <= 0:
+            continue
         elif spread[k].max() < _KNOWN:  # the shores correspond as they are
-            reach = 4 * spread[k].max() + 4 * shore.sigma + _CATALOG
-            outline = seen.pixels[k]
-            near = crossings(outline, shore.contour, shore.shown, reach)
-            fit = _judged(outline, near, shore)
-            found.append(fit if isinstance(fit, str) else fit.match)
+            known.append(k)
         else:
             own = {name: values[k : k + 1] for name, values in given.items()}
             look = _Camera(own, points, center)
-            found.append(_match(look, x0[k], P0[k], spread[k], shore))
+            found[k] = _match(look, x0[k], P0[k], spread[k], shore)
+    if known:
+        for k, near in zip(known, _near(seen.pixels, spread, shores, known), strict=True):
+            fit = _judged(seen.pixels[k], near, shores[k])
+            found[k] = fit if isinstance(fit, str) else fit.match
     return found
+
+
+def _near(
+    outlines: FloatArray, spread: FloatArray, shores: Sequence[Shore], known: Sequence[int]
+) -> list[Crossings]:
+    """Where shores that correspond as they are lie by their outlines (k, K, 2)."""
+    told = [shores[k] for k in known]
+    return crossings(
+        list(outlines[known]),
+        [shore.contour for shore in told],
+        [shore.shown for shore in told],
+        [4 * spread[k].max() + 4 * shores[k].sigma + _CATALOG for k in known],
+    )
 
 
 def _match(
@@ -241,7 +255,7 @@ def _fit(
     for _ in range(_STEPS):
         seen = look(x)
         outline = seen.pixels[0]
-        found = crossings(outline, shore.contour, shore.shown, reach)
+        (found,) = crossings([outline], [shore.contour], [shore.shown], [reach])
         if len(found.edge) < _LEAST:
             return "not found"
         told = weights(found, outline, shore.sigma, n)

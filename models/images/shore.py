@@ -20,13 +20,14 @@ what is left of it at second order.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise, starmap
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial import cKDTree
 
 from terrafix.models.core.arrays import FloatArray
 
@@ -67,59 +68,111 @@ class Crossings:
     parameter: FloatArray
 
 
+class _Polylines:
+    """Closed polylines, end to end."""
+
+    def __init__(self, each: Sequence[FloatArray]) -> None:
+        lengths = [len(points) for points in each]
+        self.starts = np.cumsum([0, *lengths])
+        self.points = np.concatenate(each)
+        self.owner = np.repeat(np.arange(len(each)), lengths)
+        following = np.arange(1, len(self.points) + 1)
+        following[self.starts[1:] - 1] = self.starts[:-1]
+        self._after = self.points[following]
+
+    @cached_property
+    def edge(self) -> FloatArray:
+        """From each vertex to the next (N, 2)."""
+        return self._after - self.points
+
+    @cached_property
+    def middle(self) -> FloatArray:
+        """Middle of each edge (N, 2)."""
+        return (self.points + self._after) / 2
+
+    @cached_property
+    def normal(self) -> FloatArray:
+        """Unit normals (N, 2) of the edges, out of the polyline for either orientation."""
+        (x, y), (x1, y1), (dx, dy) = self.points.T, self._after.T, self.edge.T
+        turn = np.sign(np.add.reduceat(x * y1 - x1 * y, self.starts[:-1]))[self.owner]
+        length = np.hypot(dx, dy)
+        scale = turn / np.where(length > 0, length, 1.0)
+        return np.stack([scale * dy, -scale * dx], axis=1)
+
+
 def outward_normals(outline: FloatArray) -> FloatArray:
     """Unit normals (K, 2) of the edges of an outline (K, 2), out of it for either orientation."""
-    after = np.roll(outline, -1, axis=0)
-    edge = after - outline
-    turn = np.sign(np.sum(outline[:, 0] * after[:, 1] - after[:, 0] * outline[:, 1]))
-    length = np.hypot(edge[:, 0], edge[:, 1])
-    across = turn * np.stack([edge[:, 1], -edge[:, 0]], axis=1)
-    return np.asarray(across / np.where(length > 0, length, 1.0)[:, None])
+    return _Polylines([outline]).normal
 
 
 def crossings(
-    outline: FloatArray, contour: FloatArray, shown: NDArray[np.bool_], reach: float
-) -> Crossings:
-    """Follow the normals of an outline to a contour.
+    outlines: Sequence[FloatArray],
+    contours: Sequence[FloatArray],
+    shown: Sequence[NDArray[np.bool_]],
+    reach: Sequence[float],
+) -> list[Crossings]:
+    """Follow the normals of outlines, each to the contour that goes with it.
 
     Parameters
     ----------
-    outline : ndarray, shape (K, 2)
+    outlines : sequence of ndarray, shape (K, 2)
         As predicted [px].
-    contour : ndarray, shape (M, 2)
+    contours : sequence of ndarray, shape (M, 2)
         As observed, closed implicitly [px].
-    shown : ndarray of bool, shape (M,)
-        Which segments of the contour, from vertex k to k + 1, are a shore that was seen.
-    reach : float
-        How far to follow them [px].
+    shown : sequence of ndarray of bool, shape (M,)
+        Which segments of each contour, from vertex k to k + 1, are a shore that was seen.
+    reach : sequence of float
+        How far to follow the normals of each [px].
     """
-    normal, facing = outward_normals(outline), outward_normals(contour)
-    middle, along = _middle(outline), np.roll(contour, -1, axis=0) - contour
-    kept = np.flatnonzero(shown)
+    own, seen = _Polylines(outlines), _Polylines(contours)
+    k, j, t, d = _met(own, seen, np.flatnonzero(np.concatenate(shown)), np.asarray(reach))
+    order = np.lexsort((j, np.abs(d), k))
+    first = order[np.diff(k[order], prepend=-1) > 0]  # the nearest of each edge
+    k, j, t, d = k[first], j[first], t[first], d[first]
+    normal = own.normal[k]
+    ends = np.searchsorted(k, own.starts)
+    return [
+        Crossings(k[part] - own.starts[i], normal[part], d[part], j[part] - seen.starts[i], t[part])
+        for i, part in enumerate(starmap(slice, pairwise(ends)))
+    ]
+
+
+def _met(
+    own: _Polylines, seen: _Polylines, kept: NDArray[np.intp], reach: FloatArray
+) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray, FloatArray]:
+    """Edges and the segments that their normals meet, where on these, and how far off."""
     if not kept.size:
-        kept = np.zeros(0, np.intp)
-        return Crossings(kept, np.empty((0, 2)), np.empty(0), kept, np.empty(0))
-    longest = np.hypot(*along[kept].T).max()
-    ends = cKDTree(middle), cKDTree(_middle(contour)[kept])
-    pairs = ends[0].sparse_distance_matrix(ends[1], reach + longest / 2, output_type="ndarray")
-    k, j = pairs["i"], kept[pairs["j"]]
-    (nx, ny), (ax, ay) = normal[k].T, along[j].T
-    ox, oy = (contour[j] - middle[k]).T
+        return kept, kept, np.empty(0), np.empty(0)
+    near = float(reach.max() + np.hypot(*seen.edge[kept].T).max() / 2) + 1e-6  # of rounding
+    k, j = _close(own, seen, kept, near)
+    (nx, ny), (ax, ay) = own.normal[k].T, seen.edge[j].T
+    ox, oy = (seen.points[j] - own.middle[k]).T
     sine = nx * ay - ny * ax
     sine = np.where(np.abs(sine) < _PARALLEL, _PARALLEL, sine)
     t, d = (ox * ny - oy * nx) / sine, (ox * ay - oy * ax) / sine
-    met = (t >= 0) & (t < 1) & (np.abs(d) < reach)
-    met &= (normal[k] * facing[j]).sum(axis=1) > _ALIKE
-    k, j, t, d = k[met], j[met], t[met], d[met]
-    order = np.lexsort((j, np.abs(d), k))
-    first = order[np.diff(k[order], prepend=-1) > 0]
-    edge = k[first]
-    return Crossings(edge, normal[edge], d[first], j[first], t[first])
+    met = (t >= 0) & (t < 1) & (np.abs(d) < reach[own.owner[k]])
+    met &= (own.normal[k] * seen.normal[j]).sum(axis=1) > _ALIKE
+    return k[met], j[met], t[met], d[met]
 
 
-def _middle(polyline: FloatArray) -> FloatArray:
-    """Middles (K, 2) of the edges of a closed polyline."""
-    return (polyline + np.roll(polyline, -1, axis=0)) / 2
+def _close(
+    own: _Polylines, seen: _Polylines, kept: NDArray[np.intp], near: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Edges and segments whose middles are no farther apart, along either axis."""
+    size = np.ptp(own.middle, axis=0)
+    along = int(size.argmax())
+    apart = 2 * (size[along] + np.ptp(seen.middle[:, along]) + near)
+    x = own.middle[:, along] + apart * own.owner  # so that none is near the contour of another
+    at = seen.middle[kept, along] + apart * seen.owner[kept]
+    order = np.argsort(at, kind="stable")
+    low, high = np.searchsorted(at[order], [x - near, x + near])
+    count = high - low
+    k = np.repeat(np.arange(len(x)), count)
+    within = np.arange(len(k)) - np.repeat(np.cumsum(count) - count, count)
+    j = kept[order[np.repeat(low, count) + within]]
+    across = 1 - along
+    close = np.abs(own.middle[k, across] - seen.middle[j, across]) <= near
+    return k[close], j[close]
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +215,7 @@ def weights(found: Crossings, outline: FloatArray, sigma: float, n_contour: int)
     n = len(found.edge)
     if n < ELEMENTS:
         raise ValueError(f"six sums need six crossings or more, got {n}")
-    middle = _middle(outline)[found.edge]
+    middle = (outline[found.edge] + outline[(found.edge + 1) % len(outline)]) / 2
     off = middle - middle.mean(axis=0)
     off = off / np.abs(off).max()
     u, v = found.normal.T

@@ -19,11 +19,15 @@ def every(contour):
     return np.ones(len(contour), dtype=bool)
 
 
+def one(outline, contour, shown, reach):
+    return crossings([outline], [contour], [shown], [reach])[0]
+
+
 @pytest.mark.parametrize("turn", [1, -1])
 def test_a_shifted_square_lies_its_shift_along_each_normal(turn):
     square = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])[::turn]
     shift = np.array([0.3, -0.2])
-    found = crossings(square, square + shift, every(square), 1.0)
+    found = one(square, square + shift, every(square), 1.0)
     assert len(found.edge) == 4
     np.testing.assert_allclose(found.distance, outward_normals(square) @ shift, atol=1e-12)
     middle = (square + np.roll(square, -1, axis=0)) / 2
@@ -33,9 +37,29 @@ def test_a_shifted_square_lies_its_shift_along_each_normal(turn):
 def test_what_was_not_seen_is_not_crossed():
     own = lake()
     shown = own[:, 0] < 150.0
-    found = crossings(own, own, shown, 2.0)
+    found = one(own, own, shown, 2.0)
     assert set(found.segment) <= set(np.flatnonzero(shown))
     assert len(found.edge) == pytest.approx(shown.sum(), abs=3)
+
+
+def test_many_are_crossed_each_with_its_own():
+    """Outlines that lie on each other and have other numbers of vertices: the bits of each alone.
+
+    One of them is not seen at all, and each has a reach of its own.
+    """
+    rng = np.random.default_rng(3)
+    outlines = [lake(n) + rng.normal(size=2) for n in (150, 90, 150, 120)]
+    contours = [lake(n) for n in (120, 150, 100, 150)]
+    shown = [every(contour) for contour in contours]
+    shown[1] = ~shown[1]
+    reach = [4.0, 4.0, 1.0, 2.5]
+    together = crossings(outlines, contours, shown, reach)
+    assert len(together[1].edge) == 0
+    for found, *asked in zip(together, outlines, contours, shown, reach, strict=True):
+        alone = one(*asked)
+        for name, values in vars(alone).items():
+            assert getattr(found, name).tobytes() == values.tobytes()
+    assert min(len(together[i].edge) for i in (0, 2, 3)) > 60
 
 
 def drawn(sigma, draws, what):
@@ -51,7 +75,7 @@ def test_sums_are_white_and_their_noise_has_no_bias():
     """Unit variance within 4 of its standard errors, mean zero within 4 of its own."""
 
     def sums(own, contour):
-        told = weights(crossings(own, contour, every(own), 4.0), own, 0.25, len(own))
+        told = weights(one(own, contour, every(own), 4.0), own, 0.25, len(own))
         assert told.told.all()
         return told.value - np.einsum("jkc,kc->j", told.of_vertices, own)
 
@@ -65,14 +89,14 @@ def test_a_straight_shore_tells_its_distance_and_its_slope():
     x = np.linspace(0.0, 100.0, 51)
     shore = np.concatenate([np.c_[x, np.zeros(51)], [[50.0, 60.0]]])
     shown = np.arange(len(shore)) < 50
-    told = weights(crossings(shore, shore, shown, 2.0), shore, 0.25, len(shore))
+    told = weights(one(shore, shore, shown, 2.0), shore, 0.25, len(shore))
     assert told.told.sum() == 2
 
 
 def test_too_few_crossings_are_refused():
     square = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
     with pytest.raises(ValueError, match="six crossings or more, got 4"):
-        weights(crossings(square, square, every(square), 1.0), square, 0.25, 4)
+        weights(one(square, square, every(square), 1.0), square, 0.25, 4)
 
 
 @pytest.mark.parametrize("part", [1.0, 0.6])
