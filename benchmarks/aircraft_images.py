@@ -6,7 +6,7 @@ The scenario is that of the tests (tests/models/radar/aircraft.py): 70 m/s at 1 
 apertures, relief of 10 m rms, 8 scatterers in a resolution cell, earlier passes with speckle of
 their own; navigators are off by 3 m and 0.1 m/s. Printed for each kind of scene: how many fixes are
 right, refused, and accepted but wrong (by 3 m); rms errors across and along the track; those over
-what the fix claims, which `FLOOR` of terrafix.models.images.aperture_matching is set by; the bias
+what the fix claims, which `SHEAR` of terrafix.models.images.aperture_matching is set by; the bias
 and scatter of map drift; then processor seconds per echo and per fix, the first also as a ratio to
 a sum with NumPy and to its own transforms.
 """
@@ -59,7 +59,9 @@ def fixes(scenario: Any, scene: Any, n: int, flight: dict[str, Any]) -> dict[str
         seen = scenario.seen_by(echo, t, believed, axis, height)
         drift = map_drift(seen.domain, seen.speed)
         image = aperture_image(seen, drift.velocity)
-        fix = matched_aperture(image.amplitude(), image.grid, reference, scene.dem.at)
+        fix = matched_aperture(
+            image.amplitude(), image.grid, reference, scene.dem.at, expected=9.0 * np.eye(2)
+        )
         cost.append(time.process_time() - start)
         if drift.accepted:
             drifts.append(drift.velocity - scenario.SPEED)

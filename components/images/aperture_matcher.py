@@ -118,7 +118,7 @@ class ApertureMatcher(OnReference, OnGround):
         middle = own.places((rows - 1) / 2, (columns - 1) / 2, dem.at)
         _, S = self._expected(np.array([m]), middle[None], np.array([own.line.speed]))
         reach = search_reach(S[0], float(self.search_sigmas[m]))
-        return matched_aperture(image, own, reference, dem.at, reach)
+        return matched_aperture(image, own, reference, dem.at, reach, S[0])
 
     def _publish(
         self, t: float, grids: dict[int, PixelGrid], found: dict[int, ApertureFix]

@@ -86,7 +86,7 @@ def test_errors_are_within_what_the_covariance_claims(aircraft, land_echo, track
     for k in range(5):
         reference = aircraft.reference(aircraft.LAND, track[1].mean(axis=0), 50 + k)
         image = image_of(aircraft, land_echo, track, rng.normal(0, 3, 3), rng.normal(0, 0.1, 3))
-        fix = matched(image, reference, aircraft.HILLS.at)
+        fix = matched(image, reference, aircraft.HILLS.at, NARROWEST, 9.0 * np.eye(2))
         assert fix.accepted
         errors.append(error(fix, track, image))
         claims.append(np.diag(fix.covariance))
@@ -95,6 +95,18 @@ def test_errors_are_within_what_the_covariance_claims(aircraft, land_echo, track
     assert errors[1] < 0.12  # along
     # of one scene, whose points lie well or badly between the pixels: many are in the benchmark
     assert (errors / np.sqrt(np.mean(claims, axis=0)) < 1.25).all()
+
+
+def test_who_is_unsure_of_his_place_claims_less_of_range(aircraft, land_echo, track, earlier):
+    """By 1.3 % of it: (0.013 x 5 m)^2; along the track nothing."""
+    image = image_of(aircraft, land_echo, track)
+    sure, unsure = (
+        matched(image, earlier, aircraft.HILLS.at, NARROWEST, expected)
+        for expected in (np.zeros((2, 2)), np.diag([25.0, 25.0]))
+    )
+    np.testing.assert_allclose(
+        unsure.covariance - sure.covariance, np.diag([0.065**2, 0.0]), atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("dp", [(-200.0, 20.0, 10.0), (150.0, -30.0, 20.0)])
