@@ -137,4 +137,6 @@ def main(*, members: int = 20, case: str = "T2", out: str | None = None) -> tf.R
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", help="write the picture there (.png)")
-    main(out=parser.parse_args().out)
+    parser.add_argument("--members", type=int, default=20)
+    given = parser.parse_args()
+    main(members=given.members, out=given.out)

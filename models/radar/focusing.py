@@ -51,6 +51,9 @@ from terrafix.models.radar.chirp import (
 )
 from terrafix.models.radar.resampling import stretched
 
+_SAMPLES = 2**14
+"""Of a batch at least: what handing it to a thread costs is little of what it takes."""
+
 
 def migration_factor(frequency: FloatArray, velocity: float, wavelength: float) -> FloatArray:
     """Cosine D of the angle off broadside at a Doppler frequency [Hz].
@@ -384,7 +387,7 @@ def _compressed(
         part *= weights[batch, None]
         data[rows[batch]] = part
 
-    over(batches(len(rows)), compress)
+    over(batches(len(rows), max(32, _SAMPLES // data.shape[1])), compress)
     data = fft.ifft(data, axis=0, overwrite_x=True, workers=-1)
     t = domain.first_time + shift + np.arange(len(frequency)) / radar.prf
     lines = _inside(

@@ -11,12 +11,11 @@ from terrafix.models.filters.lake import MOMENTS
 
 ROOT = Path(__file__).parents[2]
 IMAGE = ROOT / "examples" / "leo_lake_image.toml"
-
-
+MEMBERS = 5
 EVERY = [(f"{n}.period", "1 s") for n in ("camera", "imager", "moments", "correct", "evaluation")]
 
 
-def flown(outline, *settings, members=8, **options):
+def flown(outline, *settings, members=MEMBERS, **options):
     told = [("lakes.file", str(outline)), ("case", "T1"), *EVERY, *settings]
     system = tf.read_system(IMAGE, told)
     system.record("told", [system.find("moments")[n] for n in ("fix", "clear")], period="1")
@@ -29,14 +28,14 @@ def seen(outline):
 
 
 def test_moments_of_images_are_those_of_the_outline_within_their_noise(outline, seen):
-    """Against the contour's own moments, of the same members: 8 by 7 images, six each."""
+    """Against the contour's own moments, of the same members: 5 by 7 images, six each."""
     told = [("lakes.file", str(outline)), ("case", "T1"), *EVERY]
     exact = tf.read_system(IMAGE, told)
     exact.replace("moments", tf.components.contour_moments(rate=tf.Rate("1")))
     exact.remove("imager")
     exact.connect("camera.contour", "moments.contour")
     exact.record("told", [exact.find("moments")["fix"]], period="1")
-    truth = tf.simulate(exact, members=8).dataset["moments.fix.y"].values[1:]
+    truth = tf.simulate(exact, members=MEMBERS).dataset["moments.fix.y"].values[1:]
     y, R = (seen.dataset[f"moments.fix.{n}"].values[1:] for n in ("y", "R"))
     error = (y - truth).reshape(-1, len(MOMENTS))
     squared = np.einsum("ki,kij,kj->k", error, np.linalg.inv(R.reshape(-1, 6, 6)), error)
@@ -48,7 +47,7 @@ def test_moments_of_images_are_those_of_the_outline_within_their_noise(outline, 
 
 def test_it_is_consistent_through_images(seen):
     nees = seen.dataset["evaluation.nees"].values
-    low, high = chi2.ppf([0.0005, 0.9995], 3 * 8) / 8
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * MEMBERS) / MEMBERS
     assert low < nees[-1].mean() < high
     error = np.linalg.norm(seen.dataset["evaluation.position_error"].values[-1], axis=1)
     assert np.median(error) < 60.0

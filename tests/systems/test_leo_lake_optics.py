@@ -16,7 +16,7 @@ TEN_HZ = [
     (f"{n}.period", "0.1 s")
     for n in ("orbit", "camera", "moments", "predict", "correct", "evaluation")
 ]
-MEMBERS = 30
+MEMBERS = 15
 BOUNDS = chi2.ppf([0.0005, 0.9995], 3 * MEMBERS) / MEMBERS
 
 
@@ -55,7 +55,7 @@ def test_a_filter_that_knows_its_camera_is_consistent(outline, settings):
 def test_a_filter_that_knows_no_lens_is_off_by_what_least_squares_foretell(outline):
     """dr = (P0^-1 + sum H' R^-1 H)^-1 sum H' R^-1 dm over ten frames, the velocity known: 0.66 km.
 
-    The mean error of 30 members is that within its own sigma (chi-squared of three).
+    The mean error of 15 members is that within its own sigma (chi-squared of three).
     """
     lens = [(f"camera.{name}", value) for name, value in LENS]
     system = read(outline, *lens, ("last_known.velocity_sigma", "0.001 m/s"))

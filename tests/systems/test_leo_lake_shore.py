@@ -21,14 +21,14 @@ def read(outline, *settings, case="T3"):
 
 
 def test_part_of_a_lake_is_found_from_seventy_kilometers_and_the_filter_is_consistent(outline):
-    """All of 30 members at once; NEES of three and NIS of six in their 99.9 % intervals."""
+    """All of 15 members at once; NEES of three and NIS of six in their 99.9 % intervals."""
     system = read(outline)
     system.record("looks", [system.find("camera")["look"], system.find("matcher")["reason"]])
-    data = tf.simulate(system, members=30).dataset
+    data = tf.simulate(system, members=15).dataset
     assert np.nanmax(data["camera.look.whole"].values) == 0.0
     assert (data["matcher.reason"].values[1] == 0).all()
     nees = data["evaluation.nees"].values
-    low, high = chi2.ppf([0.0005, 0.9995], 3 * 30) / 30
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * 15) / 15
     for epoch in (1, 10, 40, 65):
         assert low < nees[epoch].mean() < high, (epoch, nees[epoch].mean())
     nis = data["evaluation.nis"].values

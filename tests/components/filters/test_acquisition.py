@@ -55,7 +55,9 @@ class Line(tf.Component):
         self.fix.publish(t, y=y, beacon=beacon, R=RANGE_SIGMA**2, present=1.0)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [1, *(pytest.param(k, marks=pytest.mark.campaign) for k in (2, 3))]
+)
 def test_two_peaks_are_not_acquired_and_one_is(seed):
     """At x and -x after one beacon, sigma |x|; at x alone after another, within five sigma of it.
 
@@ -99,7 +101,7 @@ RANGE = Observation(
 )
 PLACES = KM * np.array([[60.0, 0.0], [0.0, 80.0], [-90.0, -30.0]])
 PSD, SIGMA, SPEED = 0.5, 500.0, 10.0
-MEMBERS = 200
+MEMBERS = 100
 
 
 class Predict(FilterPredict):
@@ -187,7 +189,7 @@ BOUNDS = chi2.ppf([0.0005, 0.9995], 4 * MEMBERS) / MEMBERS
 
 
 def test_an_extended_filter_is_lost_alone_and_consistent_with_acquisition_before_it():
-    """NEES, of 4 degrees, of all 200 members: in its 99.9 % interval (3.4 to 4.7) at instants
+    """NEES, of 4 degrees, of all 100 members: in its 99.9 % interval (3.1 to 5.0) at instants
     after all were acquired; without, hundreds of times above it."""
     alone = tf.simulate(plane(acquire=False), members=MEMBERS).dataset["judge.nees"].values
     found = tf.simulate(plane(), members=MEMBERS).dataset

@@ -141,7 +141,10 @@ def test_it_flies_here(native):
     assert np.nansum(reason[:, 0]) == 6
 
 
-@pytest.mark.parametrize(("fmi", "names"), [(2, ["predict", "second"]), (3, None)])
+@pytest.mark.parametrize(
+    ("fmi", "names"),
+    [pytest.param(2, ["predict", "second"], marks=pytest.mark.campaign), (3, None)],
+)
 def test_every_part_as_an_fmu_gives_the_same_bytes(family, native, tmp_path, fmi, names):
     system = tf.read_system(family)
     for name in names or list(system.nodes):

@@ -137,7 +137,10 @@ def test_brightness_may_have_any_unit():
 # ------------------------------------------------------------------------------------- noise
 
 
-@pytest.mark.parametrize(("blur", "noise"), [(0.0, 0.05), (0.7, 0.01), (0.7, 0.05)])
+@pytest.mark.parametrize(
+    ("blur", "noise"),
+    [(0.0, 0.05), pytest.param(0.7, 0.01, marks=pytest.mark.campaign), (0.7, 0.05)],
+)
 def test_noise_is_as_stated(blur, noise):
     """Over 60 images: standard deviations to 4 standard errors, 4 / sqrt(120); means to 4.5.
 

@@ -236,7 +236,13 @@ def two_looks(name, radar):
 
 @pytest.mark.parametrize(
     ("name", "share"),
-    [("airport", 0.95), ("stanley_park", 0.95), ("ubc", 0.9), ("english_bay_1", 0.0)],
+    [
+        ("stanley_park", 0.95),
+        *(
+            pytest.param(name, share, marks=pytest.mark.campaign)
+            for name, share in (("airport", 0.95), ("ubc", 0.9), ("english_bay_1", 0.0))
+        ),
+    ],
 )
 def test_disjoint_looks_of_real_echo_are_matched(points, name, share):
     """20 places each, turned up to 12 degrees; benchmarks/matching.py has 100 and more seeds.

@@ -128,7 +128,14 @@ def test_impossible_curves_are_refused(points):
 
 
 @pytest.mark.parametrize(
-    "chunk", ["airport", "english_bay_1", "stanley_park", "ubc", "english_bay_2"]
+    "chunk",
+    [
+        "ubc",
+        *(
+            pytest.param(name, marks=pytest.mark.campaign)
+            for name in ("airport", "english_bay_1", "stanley_park", "english_bay_2")
+        ),
+    ],
 )
 def test_real_echo_is_focused_from_far_away(points, chunk):
     """100 starts within +-50 m/s: at least 90 % accepted, all of them within 10 m/s.
