@@ -25,6 +25,7 @@ from terrafix.models.core.arrays import Single
 from terrafix.models.filters.aperture_fix import expected_shift
 from terrafix.models.geometry.ground import Ground
 from terrafix.models.images.aperture_matching import (
+    DRIFT_SHARE,
     REASONS,
     ApertureFix,
     matched_aperture,
@@ -54,7 +55,7 @@ class ApertureMatcher(OnReference, OnGround):
     rows = Choice(ROWS, "shift-and-drift", doc="what is measured: with what map drift reads or not")
     search_sigmas = Parameter(3.0, positive=True, doc="how far is searched, in predicted sigmas")
     map_drift_sigma = Parameter(
-        0.05, unit="m/s", minimum=0.0, doc="error of map drift beyond what the image tells"
+        0.0, unit="m/s", minimum=0.0, doc="error of map drift beyond what the image tells"
     )
     force_sigma = Parameter(
         0.001, unit="m/s^2", minimum=0.0, doc="the IMU's white noise in the mean specific force"
@@ -137,7 +138,8 @@ class ApertureMatcher(OnReference, OnGround):
         drift = self.rows == ROWS[1]
         if drift:
             y[:, 2] = self.image.drift
-            R[who, 2, 2] = (self.image.drift_sigma**2 + self.map_drift_sigma**2)[who]
+            told = DRIFT_SHARE * self.image.drift_sigma
+            R[who, 2, 2] = (told**2 + self.map_drift_sigma**2)[who]
             present[who, 2] = self.image.focused[who]
             R[present[:, 2] < 1, 2, 2] = 1.0
         y[who] += self._expected(who, p_t[who], speed[who])[0]
