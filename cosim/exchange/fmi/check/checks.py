@@ -624,7 +624,3 @@ def run_check(file: str, kind: str, name: str) -> list[Finding]:
 def main() -> None:
     """Run checks for another process."""
     serve({"check": run_check})
-
-
-if __name__ == "__main__":
-    main()

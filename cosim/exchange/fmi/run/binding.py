@@ -104,7 +104,7 @@ _log2 = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_char_p, ct.c_int, ct.c_char_p, ct.c
 _log3 = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_int, ct.c_char_p, ct.c_char_p)(_log_of_fmi3)
 
 
-def _callbacks2(environment: int) -> Any:
+def callbacks_of_fmi2(environment: int) -> Any:
     """FMI 2's callbacks; a proxy of FMPy's formats the variadic message."""
     import fmpy.fmi2 as fmi2
 
@@ -135,6 +135,7 @@ class Library:
         self.version = archive.version
         self.interface = interface
         self.prefix = f"fmi{archive.version}"
+        self.instantiated = False
         path = archive.binary(interface.modelIdentifier)
         here = Path.cwd()
         try:
@@ -175,6 +176,12 @@ def load_library(archive: Archive, kind: str) -> Library:
     return _libraries[key]
 
 
+def was_instantiated(archive: Archive, kind: str) -> bool:
+    """Whether this process has had an instance of an FMU."""
+    found = _libraries.get((str(archive.folder), kind))
+    return found is not None and found.instantiated
+
+
 def references(values: Sequence[int]) -> Any:
     """Value references as C takes them."""
     return (ct.c_uint32 * len(values))(*values)
@@ -203,7 +210,7 @@ class Instance:
         co_simulation = library.kind == CO_SIMULATION
         if self._version == 2:
             function = library["Instantiate"]
-            self._callbacks = _callbacks2(self._environment)
+            self._callbacks = callbacks_of_fmi2(self._environment)
             arguments: list[Any] = [
                 name.encode(),
                 int(co_simulation),
@@ -224,6 +231,7 @@ class Instance:
             arguments += [ct.c_void_p(self._environment), _log3]
             arguments += [None] if co_simulation else []
         function.restype = ct.c_void_p
+        library.instantiated = True
         made = function(*arguments)
         if not made:
             raise FmuError(f"the FMU could not be instantiated{self.said()}")
