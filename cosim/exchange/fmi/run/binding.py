@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes as ct
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -54,6 +55,39 @@ class FmuError(TerrafixError):
     def __init__(self, text: str, status: int = 3) -> None:
         super().__init__(text)
         self.status = status
+
+
+class _Environment(ct.Array[ct.c_longlong]):
+    """Room for the C library's ``fenv_t``."""
+
+    _type_ = ct.c_longlong
+    _length_ = 16
+
+
+def _mathematics() -> Any:
+    names = {"win32": "ucrtbase.dll", "darwin": "libSystem.dylib", "linux": "libm.so.6"}
+    try:
+        return ct.CDLL(names.get(sys.platform))
+    except OSError:  # a C library that holds its mathematics itself
+        return ct.CDLL(None)
+
+
+_get_environment, _set_environment = (_mathematics()[f"fe{name}env"] for name in ("get", "set"))
+
+
+class Kept:
+    """A block that calls foreign code, after which the floating-point environment is ours again.
+
+    Rounding, the flushing of subnormals and traps belong to the thread, and foreign code sets them:
+    a constructor of what ``-Ofast`` linked, say.
+    """
+
+    def __enter__(self) -> None:
+        self._ours = _Environment()
+        _get_environment(self._ours)
+
+    def __exit__(self, *_: object) -> None:
+        _set_environment(self._ours)
 
 
 class _Logger2(ct.Structure):
@@ -140,7 +174,8 @@ class Library:
         here = Path.cwd()
         try:
             os.chdir(path.parent)  # what it needs may lie beside it
-            self._dll = ct.CDLL(str(path))
+            with Kept():
+                self._dll = ct.CDLL(str(path))
         except OSError as error:
             raise ConfigurationError(
                 f"the binary of '{archive.path}' cannot be loaded: {error}"
@@ -232,7 +267,8 @@ class Instance:
             arguments += [None] if co_simulation else []
         function.restype = ct.c_void_p
         library.instantiated = True
-        made = function(*arguments)
+        with Kept():
+            made = function(*arguments)
         if not made:
             raise FmuError(f"the FMU could not be instantiated{self.said()}")
         self.pointer = ct.c_void_p(made)
@@ -248,7 +284,8 @@ class Instance:
         """Call a function of the instance and refuse a status above `accept`."""
         function = self.library[name]
         function.restype = ct.c_int
-        status = int(function(self.pointer, *arguments))
+        with Kept():
+            status = int(function(self.pointer, *arguments))
         if status > accept:
             what = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
             full = f"{self.library.prefix}{name}"
@@ -284,7 +321,8 @@ class Instance:
         if self.pointer is not None:
             function = self.library["FreeInstance"]
             function.restype = None
-            function(self.pointer)
+            with Kept():
+                function(self.pointer)
             self.pointer = None
         _messages.pop(self._environment, None)
 
