@@ -76,18 +76,22 @@ _get_environment, _set_environment = (_mathematics()[f"fe{name}env"] for name in
 
 
 class Kept:
-    """A block that calls foreign code, after which the floating-point environment is ours again.
+    """A block that calls foreign code.
 
-    Rounding, the flushing of subnormals and traps belong to the thread, and foreign code sets them:
-    a constructor of what ``-Ofast`` linked, say.
+    Afterwards the floating-point environment is ours again: rounding, the flushing of subnormals
+    and traps belong to the thread, and foreign code sets them (a constructor of what ``-Ofast``
+    linked, say). Where it forked, the copy of this process ends there.
     """
 
     def __enter__(self) -> None:
+        self._process = os.getpid()
         self._ours = _Environment()
         _get_environment(self._ours)
 
     def __exit__(self, *_: object) -> None:
         _set_environment(self._ours)
+        if os.getpid() != self._process:
+            os._exit(0)
 
 
 class _Logger2(ct.Structure):

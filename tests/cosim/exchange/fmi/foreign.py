@@ -107,6 +107,6 @@ def foreign(
             _XML.format(guid=path.stem, identifier=identifier, flags=flags),
         )
         name = f"binaries/{platform.folder(2)}/{identifier}{platform.suffix}"
-        if ".." not in identifier:
+        if identifier.isidentifier():
             out.writestr(name, library.read_bytes())
     return path

@@ -5,12 +5,15 @@ from __future__ import annotations
 import ctypes
 import platform
 import sys
+import time
 
 import numpy as np
+import psutil
 import pytest
 from foreign import foreign
 
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.exchange.fmi.run import fleet
 from terrafix.cosim.exchange.fmi.run.component import Fmu
@@ -92,3 +95,62 @@ def test_the_rounding_of_a_member_is_not_that_of_the_next(tmp_path, libm, either
         create='i->x = !!strstr(name, "_0");',
     )
     assert flown(file, members=3).tolist() == [0.3333333333333333] * 3
+
+
+# ------------------------------------------------------------------ forks, and what lies outside
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_an_fmu_that_forks(tmp_path, isolate, either):
+    """The copy ends when the call returns; y = 5 after five steps, of one process alone."""
+    log = tmp_path / "processes"
+    file = foreign(
+        tmp_path / "fork.fmu",
+        f'i->y = ++i->x; if (!fork()) i->y = 1000; FILE *f = fopen("{log}", "a");'
+        ' fprintf(f, "%g\\n", i->x); fclose(f);',
+    )
+    assert flown(file, isolate=isolate) == [5]
+    for _ in range(100):  # both came that far, five times
+        if len(log.read_text().split()) == 10:
+            break
+        time.sleep(0.05)
+    assert sorted(log.read_text().split()) == sorted([*"1122334455"])
+
+
+def test_a_copy_that_outlives_its_call(tmp_path):
+    """It sleeps in the step, and would answer later; it ends with the isolated FMU."""
+    log = tmp_path / "pid"
+    step = f"""
+    i->y = ++i->x;
+    if (i->x == 2 && !fork()) {{
+        FILE *f = fopen("{log}", "w"); fprintf(f, "%d", getpid()); fclose(f);
+        sleep(60); i->y = 1000;
+    }}
+    """
+    file = foreign(tmp_path / "fork.fmu", step)
+    assert flown(file, isolate=True) == [5]
+    assert gone(int(log.read_text()))
+
+
+def gone(pid, within=5.0):
+    """Whether a process ends soon (one that is dead and that nobody has asked about is none)."""
+    for _ in range(int(within / 0.05)):
+        try:
+            if psutil.Process(pid).status() == psutil.STATUS_ZOMBIE:
+                return True
+        except psutil.NoSuchProcess:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize(
+    "identifier", ["../../../lib/libm", "a/b", "..\\a", "", "1a", "a-b", "a b", "a.b"]
+)
+def test_a_model_identifier_that_is_none(tmp_path, identifier):
+    file = foreign(tmp_path / "x.fmu", identifier=identifier)
+    with pytest.raises(ConfigurationError) as raised:
+        system(file)
+    text = str(raised.value)
+    assert f"'{file}': the modelIdentifier of CoSimulation is '{identifier}'" in text
+    assert "letters, digits and underscores" in text
