@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes as ct
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -158,6 +159,15 @@ def callbacks_of_fmi2(environment: int) -> Any:
     return given
 
 
+def _why_not(path: Path, error: OSError) -> str:
+    if hasattr(os, "statvfs") and os.statvfs(path).f_flag & os.ST_NOEXEC:
+        return (
+            f"the temporary folder {tempfile.gettempdir()} is mounted noexec\n"
+            "  let TMPDIR name one from which programs may be run"
+        )
+    return str(error)
+
+
 class Library:
     """The binary of one FMU."""
 
@@ -182,7 +192,7 @@ class Library:
                 self._dll = ct.CDLL(str(path))
         except OSError as error:
             raise ConfigurationError(
-                f"the binary of '{archive.path}' cannot be loaded: {error}"
+                f"the binary of '{archive.path}' cannot be loaded: {_why_not(path, error)}"
             ) from error
         finally:
             os.chdir(here)

@@ -194,7 +194,7 @@ def serve(functions: dict[str, Any]) -> None:
 def answer_requests(functions: dict[str, Any], requests: Any, answers: Any) -> None:
     """Answer requests from a stream to another, in this process and no copy of it."""
     process = os.getpid()
-    _end_with(requests.fileno())
+    end_with(requests.fileno())
     while True:
         try:
             number, name, arguments = receive(requests)
@@ -211,7 +211,7 @@ def answer_requests(functions: dict[str, Any], requests: Any, answers: Any) -> N
         send(answers, answer)
 
 
-def _end_with(handle: int) -> None:
+def end_with(handle: int) -> None:
     """End this process, in whatever it hangs, when nobody holds the other end of a pipe."""
     if not hasattr(select, "poll"):
         return

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import platform
 import sys
+import tempfile
 import time
 
 import numpy as np
@@ -16,6 +18,8 @@ from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.exchange.fmi.run import fleet
+from terrafix.cosim.exchange.fmi.run.archive import open_archive
+from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, load_library
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.system.system import System
 
@@ -154,3 +158,21 @@ def test_a_model_identifier_that_is_none(tmp_path, identifier):
     text = str(raised.value)
     assert f"'{file}': the modelIdentifier of CoSimulation is '{identifier}'" in text
     assert "letters, digits and underscores" in text
+
+
+@pytest.mark.skipif(not hasattr(os, "statvfs"), reason="has no such mounts")
+def test_a_temporary_folder_without_programs_is_named(tmp_path, monkeypatch):
+    file = foreign(tmp_path / "x.fmu")
+    archive = open_archive(file)
+    binary = archive.binary("foreign")
+    binary.write_bytes(b"the loader refuses this, as it would refuse all that lies there")
+    mount = os.statvfs(binary)
+    flags = list(mount)
+    flags[8] |= os.ST_NOEXEC
+    monkeypatch.setattr(os, "statvfs", lambda _: os.statvfs_result(flags))
+    with pytest.raises(ConfigurationError) as raised:
+        load_library(archive, CO_SIMULATION)
+    assert str(raised.value) == (
+        f"the binary of '{file}' cannot be loaded: the temporary folder {tempfile.gettempdir()} is "
+        "mounted noexec\n  let TMPDIR name one from which programs may be run"
+    )
