@@ -31,7 +31,7 @@ void *fmi2Instantiate(const char *name, int type, const char *guid, const char *
     @create@
     return i;
 }
-void fmi2FreeInstance(void *c) { free(c); }
+void fmi2FreeInstance(void *c) { @freed@ free(c); }
 int fmi2SetDebugLogging(void *c, int on, size_t n, const char *const categories[]) { return 0; }
 int fmi2SetupExperiment(void *c, int a, double b, double t, int d, double e) { return 0; }
 int fmi2EnterInitializationMode(void *c) { return 0; }
@@ -86,6 +86,7 @@ def foreign(
     *,
     globals_="",
     create="",
+    freed="",
     flags="",
     identifier="foreign",
     options=(),
@@ -95,7 +96,12 @@ def foreign(
     An instance has the numbers u, k, x, y; `options` are of the compiler.
     """
     source = path.with_suffix(".c")
-    filled = _C.replace("@globals@", globals_).replace("@create@", create).replace("@step@", step)
+    filled = (
+        _C.replace("@globals@", globals_)
+        .replace("@create@", create)
+        .replace("@freed@", freed)
+        .replace("@step@", step)
+    )
     source.write_text(filled)
     library = path.with_suffix(".so")
     command = [*working_compiler().command, "-shared", "-fPIC", "-w", *options]

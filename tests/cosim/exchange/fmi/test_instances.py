@@ -9,6 +9,7 @@ from foreign import foreign
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import StepError
 from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.exchange.fmi.check.check import check_fmu
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.fmi.run.loop import FmuLoop
 from terrafix.cosim.system.system import System
@@ -16,6 +17,12 @@ from terrafix.cosim.system.system import System
 COUNTER = "static double count;"
 COUNTS = "count += 1; i->y = count;"  # 20-sim's FMUs keep their states so
 ONCE = 'canBeInstantiatedOnlyOncePerProcess="true"'
+STATE = """
+int fmi2GetFMUstate(void *c, void **s) { if (!*s) *s = malloc(sizeof(struct instance));
+    memcpy(*s, c, sizeof(struct instance)); return 0; }
+int fmi2SetFMUstate(void *c, void *s) { memcpy(c, s, sizeof(struct instance)); return 0; }
+int fmi2FreeFMUstate(void *c, void **s) { free(*s); *s = NULL; return 0; }
+"""
 
 
 def flown(*parts, members=1, duration="0.5", **options):
@@ -98,6 +105,20 @@ def test_once_per_process_is_believed(tmp_path):
     assert "says that it can be instantiated once in a process" in result.notes[0]
 
 
+def test_once_per_process_is_believed_by_the_checks(tmp_path):
+    """A second instance beside one is refused, and none is asked for."""
+    file = foreign(
+        tmp_path / "x.fmu",
+        globals_="static int made;" + STATE,
+        create="if (made++) { free(i); return NULL; }",
+        freed="made--;",
+        flags=f'canGetAndSetFMUstate="true" {ONCE}',
+    )
+    report = check_fmu(file)
+    assert [f.what for f in report.findings if "instantiated" in f.what] == []
+    assert ("instances", "it says so") in {(f.check, f.what) for f in report.notes}
+
+
 def test_members_apart_have_their_own_start_values_and_inputs(tmp_path):
     """x' = u between FMUs: y = t + t^2 / 2 of explicit Euler, 0.1 (1 + ... ) by hand."""
     source = foreign(tmp_path / "source.fmu", "i->x += 1; i->y = i->x;", flags=ONCE)
@@ -143,16 +164,10 @@ def test_all_members_that_crash_end_the_run(tmp_path):
 
 def test_a_loop_of_fmus_that_can_be_instantiated_once(tmp_path):
     """The implicit Euler method, 1 / 0.9^5: states are kept and set back in those processes."""
-    state = """
-    int fmi2GetFMUstate(void *c, void **s) { if (!*s) *s = malloc(sizeof(struct instance));
-        memcpy(*s, c, sizeof(struct instance)); return 0; }
-    int fmi2SetFMUstate(void *c, void *s) { memcpy(c, s, sizeof(struct instance)); return 0; }
-    int fmi2FreeFMUstate(void *c, void **s) { free(*s); *s = NULL; return 0; }
-    """
     file = foreign(
         tmp_path / "x.fmu",
         "i->x += h * i->u; i->y = i->x;",
-        globals_=state,
+        globals_=STATE,
         create="i->x = i->y = 1;",
         flags=f'canGetAndSetFMUstate="true" {ONCE}',
     )
