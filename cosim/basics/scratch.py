@@ -1,7 +1,9 @@
-"""Folders of this process alone: gone when it ends, and gone after the next one if it was killed.
+"""Folders of this process alone: gone when it ends, however it ends.
 
 All lie in one, ``terrafix-<random>`` among the system's temporary files, beside a lock that this
-process holds. Whoever makes one first removes those whose lock nobody holds any more.
+process holds. A shell waits for the end of this process, and removes what it left if it was killed.
+Where there is none, or it was killed too, who makes such a folder next removes those whose lock
+nobody holds any more.
 """
 
 from __future__ import annotations
@@ -11,6 +13,8 @@ import os
 import re
 import secrets
 import shutil
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -44,11 +48,31 @@ def _root() -> Path:
     everybodys = Path(tempfile.gettempdir())
     _sweep(everybodys)
     folder = everybodys / f"terrafix-{secrets.token_hex(8)}"
+    janitor = _janitor(folder)
     lock = _lock(folder)
     lock.acquire(blocking=False)
     folder.mkdir(mode=0o700)
-    atexit.register(_leave, folder, lock, os.getpid())
+    atexit.register(_leave, folder, lock, os.getpid(), janitor)
     return folder
+
+
+_REMOVE = 'trap "" INT TERM HUP; read _; rm -rf -- "$1" "$1.lock"'
+
+
+def _janitor(folder: Path) -> subprocess.Popen[bytes] | None:
+    """A shell that removes a folder when nobody holds the other end of its input any more."""
+    if sys.platform == "win32":
+        return None
+    with suppress(OSError):
+        return subprocess.Popen(
+            ["/bin/sh", "-c", _REMOVE, "sh", str(folder)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd="/",
+            start_new_session=True,
+        )
+    return None
 
 
 def _lock(folder: Path) -> BaseFileLock:
@@ -69,9 +93,15 @@ def _sweep(everybodys: Path) -> None:
                 _remove(folder, lock)
 
 
-def _leave(folder: Path, lock: BaseFileLock, process: int) -> None:
-    if os.getpid() == process:  # a fork's end is not ours
-        _remove(folder, lock)
+def _leave(
+    folder: Path, lock: BaseFileLock, process: int, janitor: subprocess.Popen[bytes] | None = None
+) -> None:
+    if os.getpid() != process:  # a fork's end is not ours
+        return
+    _remove(folder, lock)
+    if janitor is not None:
+        janitor.kill()
+        janitor.wait()
 
 
 def _remove(folder: Path, lock: BaseFileLock) -> None:

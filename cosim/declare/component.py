@@ -211,6 +211,7 @@ class Component(Shown):
         self._environment: Environment | None = None
         self._streams: dict[tuple[str, int], NormalBlocks] = {}
         self.step_index = 0
+        self.remarks: list[str] = []
         declared = self.settings()
         for name, value in self.declarations.items():
             if isinstance(value, Port):

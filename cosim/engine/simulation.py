@@ -276,7 +276,12 @@ class Simulation:
             for path, slot in self.master.wiring.slots.items()
             if isinstance(slot, SignalSlot) and slot.never_written
         ]
-        return [f"output '{path}' was never published" for path in silent]
+        remarks = [
+            f"'{path}': {remark}"
+            for path, component in self.plan.flat.components.items()
+            for remark in component.remarks
+        ]
+        return remarks + [f"output '{path}' was never published" for path in silent]
 
     def flight(self) -> Flight:
         """What was flown so far."""

@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from terrafix.cli import campaign, exchange, inspect, run, smooth
-from terrafix.cli.output import FAILED, REFUSED, print_json
+from terrafix.cli.output import FAILED, REFUSED, keep_standard_output, print_json
 from terrafix.cosim.basics.errors import StepError, SystemCheckError, TerrafixError
 
 
@@ -28,6 +28,7 @@ class Cli(click.Group):
         """Run the command line and leave with an exit status."""
         words = list(sys.argv[1:] if args is None else args)
         options["standalone_mode"] = False
+        keep_standard_output()
         try:
             status = super().main(words, prog_name or "terrafix", **options) or 0
         except Exception as error:

@@ -3,10 +3,28 @@
 from __future__ import annotations
 
 import os
+import sys
+from contextlib import suppress
 from typing import Any
 
 FAILED, REFUSED = 1, 2
 """Exit status of a run that failed, and of bad input."""
+
+
+def keep_standard_output() -> None:
+    """Let standard output be Python's alone: what foreign code prints goes to standard error."""
+    out = sys.__stdout__
+    if out is None or sys.stdout is not out:
+        return  # somebody has taken care
+    with suppress(OSError, ValueError):  # it was closed
+        if out.fileno() != 1:
+            return
+        out.flush()
+        ours = os.dup(1)
+        os.dup2(2, 1)
+        sys.stdout = sys.__stdout__ = os.fdopen(  # type: ignore[misc]
+            ours, "w", encoding=out.encoding, errors=out.errors
+        )
 
 
 def print_json(content: dict[str, Any]) -> None:

@@ -20,6 +20,7 @@ from terrafix.cli.options import (
     target_of,
 )
 from terrafix.cli.output import FAILED, print_json, show
+from terrafix.cli.watch import watch_foreign_code
 from terrafix.cosim.basics.errors import ConfigurationError, StepError, TerrafixError
 
 if TYPE_CHECKING:
@@ -67,12 +68,14 @@ def run(
 
     shown = not quiet and stderr_is_terminal()
     failure: StepError | None = None
-    with ProgressBar(shown=shown, first="preparing", on_running=say_kernel) as progress:
-        from terrafix.cosim.engine.run import RunError, simulate
-
+    with ProgressBar(shown=shown, first="preparing"):
         loaded = read(system, settings)
         if figure is not None:
             _drawable(loaded)
+    watch_foreign_code(loaded)
+    with ProgressBar(shown=shown, first="preparing", on_running=say_kernel) as progress:
+        from terrafix.cosim.engine.run import RunError, simulate
+
         try:
             result = simulate(
                 loaded,

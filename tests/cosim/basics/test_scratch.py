@@ -4,7 +4,11 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
+
+import psutil
+import pytest
 
 from terrafix.cosim.basics import scratch
 
@@ -39,11 +43,27 @@ def test_a_process_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell removes it")
+def test_one_that_is_killed_leaves_nothing(tmp_path):
+    process, folder = holder(tmp_path)
+    (folder / "file").touch()
+    helpers = psutil.Process(process.pid).children()
+    with process:
+        process.kill()
+    until = time.monotonic() + 10
+    while list(tmp_path.iterdir()) and time.monotonic() < until:
+        time.sleep(0.02)
+    assert not list(tmp_path.iterdir())
+    assert not psutil.wait_procs(helpers, timeout=10)[1]
+
+
 def test_the_next_removes_what_a_killed_one_left_and_nothing_else(tmp_path):
     dead, left = holder(tmp_path)
     alive, kept = holder(tmp_path)
     (tmp_path / "terrafix-notes").mkdir()  # somebody's own
     with dead, alive:
+        for process in psutil.Process(dead.pid).children():
+            process.kill()  # it would be quicker
         dead.kill()
         dead.wait()
         assert left.is_dir()

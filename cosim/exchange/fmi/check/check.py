@@ -135,6 +135,9 @@ def check_fmu(
             except TerrafixError as error:
                 report.add(Finding(name, ERROR, kind, str(error), "no importer gets further"))
                 break
+            if worker is not None and offered[kind].canBeInstantiatedOnlyOncePerProcess:
+                worker.close()
+                worker = None
     finally:
         if worker is not None:
             worker.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import stat
 import zipfile
@@ -178,6 +179,15 @@ def checked_xml(path: Path, file: Path) -> bytes:
     return data
 
 
+def _check_identifier(identifier: str, tag: str, file: Path) -> None:
+    """It names a file: it must not lead elsewhere."""
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
+        raise ConfigurationError(
+            f"'{file}': the modelIdentifier of {tag} is '{identifier}'; FMI demands letters, "
+            "digits and underscores, no digit first\n  ask for another from the tool that wrote it"
+        )
+
+
 def _read(file: Path, folder: Path) -> Archive:
     from xml.etree import ElementTree as ET
 
@@ -206,6 +216,9 @@ def _read(file: Path, folder: Path) -> Archive:
             f"'{file}': modelDescription.xml cannot be understood: {why}\n"
             "  ask for another from the tool that wrote it"
         ) from error
+    for tag in ("CoSimulation", "ModelExchange", "ScheduledExecution"):
+        for each in root.iter(tag):
+            _check_identifier(each.get("modelIdentifier", ""), tag, file)
     directional = any(
         each.get(name) in ("true", "1")
         for tag in ("CoSimulation", "ModelExchange")

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import ctypes as ct
 import os
+import sys
+import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -54,6 +56,43 @@ class FmuError(TerrafixError):
     def __init__(self, text: str, status: int = 3) -> None:
         super().__init__(text)
         self.status = status
+
+
+class _Environment(ct.Array[ct.c_longlong]):
+    """Room for the C library's ``fenv_t``."""
+
+    _type_ = ct.c_longlong
+    _length_ = 16
+
+
+def _mathematics() -> Any:
+    names = {"win32": "ucrtbase.dll", "darwin": "libSystem.dylib", "linux": "libm.so.6"}
+    try:
+        return ct.CDLL(names.get(sys.platform))
+    except OSError:  # a C library that holds its mathematics itself
+        return ct.CDLL(None)
+
+
+_get_environment, _set_environment = (_mathematics()[f"fe{name}env"] for name in ("get", "set"))
+
+
+class Kept:
+    """A block that calls foreign code.
+
+    Afterwards the floating-point environment is ours again: rounding, the flushing of subnormals
+    and traps belong to the thread, and foreign code sets them (a constructor of what ``-Ofast``
+    linked, say). Where it forked, the copy of this process ends there.
+    """
+
+    def __enter__(self) -> None:
+        self._process = os.getpid()
+        self._ours = _Environment()
+        _get_environment(self._ours)
+
+    def __exit__(self, *_: object) -> None:
+        _set_environment(self._ours)
+        if os.getpid() != self._process:
+            os._exit(0)
 
 
 class _Logger2(ct.Structure):
@@ -104,7 +143,7 @@ _log2 = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_char_p, ct.c_int, ct.c_char_p, ct.c
 _log3 = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_int, ct.c_char_p, ct.c_char_p)(_log_of_fmi3)
 
 
-def _callbacks2(environment: int) -> Any:
+def callbacks_of_fmi2(environment: int) -> Any:
     """FMI 2's callbacks; a proxy of FMPy's formats the variadic message."""
     import fmpy.fmi2 as fmi2
 
@@ -118,6 +157,15 @@ def _callbacks2(environment: int) -> Any:
 
         addLoggerProxy(ct.byref(given))
     return given
+
+
+def _why_not(path: Path, error: OSError) -> str:
+    if hasattr(os, "statvfs") and os.statvfs(path).f_flag & os.ST_NOEXEC:
+        return (
+            f"the temporary folder {tempfile.gettempdir()} is mounted noexec\n"
+            "  let TMPDIR name one from which programs may be run"
+        )
+    return str(error)
 
 
 class Library:
@@ -135,14 +183,16 @@ class Library:
         self.version = archive.version
         self.interface = interface
         self.prefix = f"fmi{archive.version}"
+        self.instantiated = False
         path = archive.binary(interface.modelIdentifier)
         here = Path.cwd()
         try:
             os.chdir(path.parent)  # what it needs may lie beside it
-            self._dll = ct.CDLL(str(path))
+            with Kept():
+                self._dll = ct.CDLL(str(path))
         except OSError as error:
             raise ConfigurationError(
-                f"the binary of '{archive.path}' cannot be loaded: {error}"
+                f"the binary of '{archive.path}' cannot be loaded: {_why_not(path, error)}"
             ) from error
         finally:
             os.chdir(here)
@@ -175,6 +225,12 @@ def load_library(archive: Archive, kind: str) -> Library:
     return _libraries[key]
 
 
+def was_instantiated(archive: Archive, kind: str) -> bool:
+    """Whether this process has had an instance of an FMU."""
+    found = _libraries.get((str(archive.folder), kind))
+    return found is not None and found.instantiated
+
+
 def references(values: Sequence[int]) -> Any:
     """Value references as C takes them."""
     return (ct.c_uint32 * len(values))(*values)
@@ -203,7 +259,7 @@ class Instance:
         co_simulation = library.kind == CO_SIMULATION
         if self._version == 2:
             function = library["Instantiate"]
-            self._callbacks = _callbacks2(self._environment)
+            self._callbacks = callbacks_of_fmi2(self._environment)
             arguments: list[Any] = [
                 name.encode(),
                 int(co_simulation),
@@ -224,7 +280,9 @@ class Instance:
             arguments += [ct.c_void_p(self._environment), _log3]
             arguments += [None] if co_simulation else []
         function.restype = ct.c_void_p
-        made = function(*arguments)
+        library.instantiated = True
+        with Kept():
+            made = function(*arguments)
         if not made:
             raise FmuError(f"the FMU could not be instantiated{self.said()}")
         self.pointer = ct.c_void_p(made)
@@ -240,7 +298,8 @@ class Instance:
         """Call a function of the instance and refuse a status above `accept`."""
         function = self.library[name]
         function.restype = ct.c_int
-        status = int(function(self.pointer, *arguments))
+        with Kept():
+            status = int(function(self.pointer, *arguments))
         if status > accept:
             what = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
             full = f"{self.library.prefix}{name}"
@@ -276,7 +335,8 @@ class Instance:
         if self.pointer is not None:
             function = self.library["FreeInstance"]
             function.restype = None
-            function(self.pointer)
+            with Kept():
+                function(self.pointer)
             self.pointer = None
         _messages.pop(self._environment, None)
 

@@ -27,14 +27,14 @@ from terrafix.cosim.declare.ports import (
 )
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
-from terrafix.cosim.exchange.fmi.run.fleet import Failures, Fleet, Group, Message, Setup
+from terrafix.cosim.exchange.fmi.run.fleet import Failures, Group, Message, Setup
+from terrafix.cosim.exchange.fmi.run.places import AnyFleet, make_fleet
 from terrafix.cosim.exchange.fmi.run.reading import (
     ImportedPort,
     Interface,
     Quantity,
     read_interface,
 )
-from terrafix.cosim.exchange.fmi.run.remote import RemoteFleet
 from terrafix.cosim.exchange.fmi.run.solvers import SOLVERS
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.memory.messages import MessageReader
@@ -71,7 +71,7 @@ class Fmu(Component):
     )
 
     _interface: Interface | None = None
-    _fleet: Fleet | RemoteFleet | None = None
+    _fleet: AnyFleet | None = None
 
     # ------------------------------------------------------------------ declaration
 
@@ -247,18 +247,22 @@ class Fmu(Component):
             self.given_parameters["solver"],
             float(self.given_parameters["tolerance"]),
         )
-        limit = float(self.given_parameters["time_limit"])
-        self._fleet = (
-            RemoteFleet(setup, env.n_members, limit)
-            if self.given_parameters["isolate"]
-            else Fleet(setup, env.n_members)
+        starts = np.zeros((env.n_members, sum(g.size for g in inputs)))
+        for port, name, quantity in read:
+            starts[:, self._input_at[port, name]] = self._start_value(quantity).ravel()
+        self._fleet, remark = make_fleet(
+            interface,
+            setup,
+            starts,
+            usual_step(self.rate),
+            isolate=self.given_parameters["isolate"],
+            limit=float(self.given_parameters["time_limit"]),
         )
+        self.remarks = [remark] if remark else []
         self._sequence = {p.name: np.zeros(env.n_members, np.int64) for p in self._outputs}
         self._t, self._first = 0.0, True
         self._skipped = ~env.active
-        for port, name, quantity in read:
-            columns = self._input_at[port, name]
-            self._fleet.inputs[:, columns] = self._start_value(quantity).ravel()
+        self._fleet.inputs[...] = starts
         self._take_inputs(finite=True)
         self._bind_copies()
         self._report(self._fleet.start(env.active.copy(), self._fresh_messages()))
@@ -421,6 +425,13 @@ class Fmu(Component):
         for name, numbers in saved["sequence"].items():
             self._sequence[name][...] = numbers
         self._t, self._first = float(saved["t"]), bool(saved["first"])
+
+
+def usual_step(rate: Rate | None) -> float:
+    """Length of a step [s]; of the first, where times are listed."""
+    if rate is None or rate.times is None:
+        return float((rate and rate.period) or 0)
+    return float(next((t for t in rate.times if t), 0))
 
 
 def grouped(

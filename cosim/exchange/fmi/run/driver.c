@@ -8,6 +8,68 @@
 #include <stdint.h>
 #include <string.h>
 
+/* Rounding, flushing of subnormals and traps of this thread: ours again after each instance. */
+#if defined(__x86_64__) && defined(__GNUC__)
+#include <xmmintrin.h>
+
+struct environment { unsigned sse; unsigned short x87; };
+
+static inline struct environment environment(void)
+{
+    struct environment e = {_mm_getcsr() & ~0x3Fu, 0}; /* without what has happened */
+    __asm__ volatile("fnstcw %0" : "=m"(e.x87));
+    return e;
+}
+
+static inline void restore(const struct environment *ours)
+{
+    struct environment now = environment();
+    if (now.sse != ours->sse)
+        _mm_setcsr(ours->sse);
+    if (now.x87 != ours->x87)
+        __asm__ volatile("fnclex\n\tfldcw %0" : : "m"(ours->x87));
+}
+#else
+#include <fenv.h>
+
+struct environment { fenv_t all; };
+
+static inline struct environment environment(void)
+{
+    struct environment e;
+    fegetenv(&e.all);
+    return e;
+}
+
+static inline void restore(const struct environment *ours) { fesetenv(&ours->all); }
+#endif
+
+/* A page that the kernel wipes in a copy of this process: tells whether an FMU has forked. */
+#if defined(__linux__)
+#include <sys/mman.h>
+#include <unistd.h>
+#endif
+#if defined(MADV_WIPEONFORK)
+static volatile int *this_process(void)
+{
+    static volatile int always = 1, *page = 0;
+    if (!page) {
+        void *made = mmap(0, 4096, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+        page = made != MAP_FAILED && !madvise(made, 4096, MADV_WIPEONFORK) ? made : &always;
+    }
+    return page;
+}
+#define BEGIN volatile int *here = this_process(); *here = 1
+#define END_IF_COPIED do { if (!*here) _exit(0); } while (0)
+#elif defined(_WIN32)
+#define BEGIN
+#define END_IF_COPIED
+#else
+#include <unistd.h>
+#define BEGIN const pid_t here = getpid()
+#define END_IF_COPIED do { if (getpid() != here) _exit(0); } while (0)
+#endif
+
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
 #else
@@ -76,10 +138,14 @@ static enum failure step_one(const struct binding *b, void *instance, const doub
 EXPORT int64_t terrafix_step_fmus(const struct binding *b)
 {
     int64_t n_failed = 0;
+    BEGIN;
+    const struct environment ours = environment();
     for (int64_t m = 0; m < b->n_members; m++)
         if (b->active[m] && !b->failed[m]) {
             b->failed[m] = (uint8_t)step_one(b, b->instance[m], b->input + m * b->n_inputs,
                                              b->output + m * b->n_outputs);
+            restore(&ours);
+            END_IF_COPIED;
             n_failed += b->failed[m] != NONE;
         }
     return n_failed;

@@ -23,6 +23,7 @@ from terrafix.cosim.exchange.fmi.run.binding import (
     CO_SIMULATION,
     FmuError,
     Instance,
+    Kept,
     load_library,
     references,
 )
@@ -133,17 +134,20 @@ class _Quick:
 
     def __call__(self, t: float, h: float) -> None:
         self._t.value, self._h.value = t, h
+        with Kept():
+            self._call()
+        if self._get is not None and self._dot(self._zeros) != 0.0:  # NaN: one is not finite
+            raise FmuError("an output is not finite")
+
+    def _call(self) -> None:
         if self._set is not None and self._set(*self._set_arguments) > 1:
             raise FmuError(f"{_REASONS[1]}{self._instance.said()}")
         if self._step(*self._step_arguments) > 1:
             raise FmuError(f"{_REASONS[2]}{self._instance.said()}")
         if self._ended is not None and (self._ended[0].value or self._ended[1].value):
             raise FmuError(_REASONS[5])
-        if self._get is not None:
-            if self._get(*self._get_arguments) > 1:
-                raise FmuError(f"{_REASONS[3]}{self._instance.said()}")
-            if self._dot(self._zeros) != 0.0:  # NaN: something is not finite
-                raise FmuError("an output is not finite")
+        if self._get is not None and self._get(*self._get_arguments) > 1:
+            raise FmuError(f"{_REASONS[3]}{self._instance.said()}")
 
 
 class _Binding(ct.Structure):

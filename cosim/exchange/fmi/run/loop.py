@@ -19,8 +19,9 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Count, FileTable, Parameter, Text
 from terrafix.cosim.declare.ports import Capabilities, Input, Output, Port
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION
-from terrafix.cosim.exchange.fmi.run.component import Fmu, grouped
-from terrafix.cosim.exchange.fmi.run.fleet import Fleet, Setup
+from terrafix.cosim.exchange.fmi.run.component import Fmu, grouped, usual_step
+from terrafix.cosim.exchange.fmi.run.fleet import Setup
+from terrafix.cosim.exchange.fmi.run.places import AnyFleet, make_fleet
 from terrafix.cosim.system.wiring import check_connection, port_factor
 
 _CONNECTION = re.compile(r"\s*(\w+)\.(\w+)\s*->\s*(\w+)\.(\w+)\s*\Z")
@@ -110,7 +111,8 @@ class FmuLoop(Component):
 
     def _initialize_impl(self) -> None:
         env = self.environment
-        self._fleets: dict[str, Fleet] = {}
+        self._fleets: dict[str, AnyFleet] = {}
+        self.remarks = []
         self._at: dict[tuple[str, str], slice] = {}
         for name, part in self._parts.items():
             ports = part.interface.ports
@@ -121,9 +123,13 @@ class FmuLoop(Component):
             self._at |= {(name, port): at for (port, _), at in (input_at | output_at).items()}
             file = str(part.interface.archive.path.absolute())
             setup = Setup(file, CO_SIMULATION, f"{env.path}.{name}", inputs, outputs)
-            fleet = self._fleets[name] = Fleet(setup, env.n_members)
+            starts = np.zeros((env.n_members, sum(g.size for g in inputs)))
             for port in part.inputs():
-                fleet.inputs[:, self._at[name, port]] = np.asarray(part.ports[port].default).ravel()
+                starts[:, self._at[name, port]] = np.asarray(part.ports[port].default).ravel()
+            fleet, remark = make_fleet(part.interface, setup, starts, usual_step(self.rate))
+            self._fleets[name] = fleet
+            self.remarks += [remark] if remark else []
+            fleet.inputs[...] = starts
         self._t = 0.0
         self._outside(finite=True)
         for name, fleet in self._fleets.items():

@@ -128,6 +128,8 @@ class Interface:
         Whether its state can be got and set, and written as bytes.
     own : bool
         Whether terrafix wrote it.
+    once : bool
+        Whether it says that a process can have one instance of it.
     """
 
     archive: Archive
@@ -138,6 +140,7 @@ class Interface:
     state: bool
     serialize: bool
     own: bool
+    once: bool = False
 
 
 def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True) -> Interface:
@@ -178,6 +181,7 @@ def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True)
         bool(interface.canGetAndSetFMUstate),
         bool(interface.canGetAndSetFMUstate and interface.canSerializeFMUstate),
         own=archive.annotation is not None,
+        once=bool(interface.canBeInstantiatedOnlyOncePerProcess),
     )
 
 

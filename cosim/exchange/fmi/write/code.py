@@ -18,6 +18,7 @@ from terrafix.cosim.kernels.toolchain import c_source
 
 LANES = 4  # as in core.c
 SMALL = 2000  # instructions of a function that shares a file with others
+_ARGUMENTS = "const double **, double **, long long int *, double *, int"
 FIXED = ("core.h", "core.c", "portable.h")
 
 
@@ -120,7 +121,7 @@ def function_source(name: str, functions: Sequence[Any]) -> str:
     generator = ca.CodeGenerator(name, {"with_header": False})
     for function in functions:
         generator.add(function)
-    head = '#include "portable.h"\n#define CASADI_SYMBOL_EXPORT\n'
+    head = '#include "portable.h"\n#define CASADI_SYMBOL_EXPORT WITHIN\n'
     return head + without_null_checks(generator.dump())
 
 
@@ -131,10 +132,7 @@ def model_source(layout: Layout) -> str:
         '#include "core.h"',
         "#include <math.h>",
         "",
-        *(
-            f"int {function.name()}(const double **, double **, long long int *, double *, int);"
-            for function in _functions(layout)
-        ),
+        *(f"WITHIN int {f.name()}({_ARGUMENTS});" for f in _functions(layout)),
         "",
         "const char instantiation_token[] = TOKEN;",
         "",

@@ -1,6 +1,7 @@
 /* The part of an exported FMU that is the same for FMI 2 and 3: read core.h first. */
 #include "core.h"
 
+#include <float.h>
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
@@ -405,6 +406,10 @@ enum status advance(struct instance *i, double t, double h)
     if (!(fabs(t - here) <= 0.5 * tick))
         return fail(i, "a step from t = %.9g s is refused: this instance stands at %.9g s", t,
                     here);
+    double end = now->start_time + TICKS_TO_SECONDS(now->tick + (int64_t)count);
+    if (now->stops && end > now->stop_time + 0.5 * tick)
+        return fail(i, "a step to t = %.9g s is refused: the stop time is %.9g s", end,
+                    now->stop_time);
     return step_to(i, now->tick + (int64_t)count);
 }
 
@@ -555,7 +560,7 @@ enum status get_real(struct instance *i, int32_t offset, int32_t size, double *v
         return ERROR;
     const double *from = i->now.real + (v->flags & STATE ? v->state + offset - v->offset : offset);
     for (int32_t k = 0; k < size; k++)
-        value[k] = from[k];
+        value[k] = is_finite(from[k]) || is_nan(from[k]) ? from[k] : copysign(DBL_MAX, from[k]);
     return OK;
 }
 
@@ -596,8 +601,10 @@ enum status set_real(struct instance *i, const struct variable *v, int32_t eleme
                         : v->flags & POSITIVE ? 0
                                               : v->minimum);
     }
-    memcpy(i->now.real + (v->flags & STATE ? v->state : v->offset) + element, value,
-           size * sizeof(double));
+    double *to = i->now.real + (v->flags & STATE ? v->state : v->offset) + element;
+    for (int32_t k = 0; k < size; k++) /* XML may know no infinity: the largest number stands for it */
+        to[k] = v->flags & INFINITE && fabs(value[k]) >= DBL_MAX ? copysign(INFINITY, value[k])
+                                                                 : value[k];
     i->now.stale = 1;
     return OK;
 }

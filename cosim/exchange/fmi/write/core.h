@@ -14,6 +14,8 @@
 #ifndef TERRAFIX_CORE_H
 #define TERRAFIX_CORE_H
 
+#include "portable.h"
+
 #include <stddef.h>
 #include <stdint.h>
 
@@ -111,15 +113,16 @@ struct continuous {
 
 /* ---------------------------------------------------------------------------- from model.c -- */
 
-extern const struct variable real_variable[], integer_variable[];
-extern const int32_t n_real_variables, n_integer_variables;
-extern const int32_t n_variable_reals; /* numbers of all real variables: the first of `real` */
-extern const int32_t owner_of_real[];
-extern const double real_start[];
-extern const int64_t integer_start[];
-extern const struct part parts[];
-extern const struct continuous continuous;
-extern const char instantiation_token[];
+extern WITHIN const struct variable real_variable[], integer_variable[];
+extern WITHIN const int32_t n_real_variables, n_integer_variables;
+/* numbers of all real variables: the first of `real` */
+extern WITHIN const int32_t n_variable_reals;
+extern WITHIN const int32_t owner_of_real[];
+extern WITHIN const double real_start[];
+extern WITHIN const int64_t integer_start[];
+extern WITHIN const struct part parts[];
+extern WITHIN const struct continuous continuous;
+extern WITHIN const char instantiation_token[];
 
 #include "sizes.h"
 
@@ -133,7 +136,8 @@ struct data {
     int64_t integer[N_INTEGER];
     int64_t sent[N_PARTS][N_MESSAGES]; /* messages of the last step */
     uint64_t key[N_STREAMS];
-    double start_time;
+    double start_time, stop_time;
+    int64_t stops; /* whether there is a stop time */
     int64_t event_tick;
     int64_t stale; /* whether outputs have to be calculated anew before they are read */
     double real[N_REAL];
@@ -153,37 +157,39 @@ struct instance {
     double w[N_W];
 };
 
-struct instance *create(const char *name, const char *token);
-void set_start_values(struct instance *);
-enum status fail(struct instance *, const char *format, ...);
-void warn(struct instance *, const char *format, ...);
-const char *element_name(const struct variable *, int32_t element);
+WITHIN struct instance *create(const char *name, const char *token);
+WITHIN void set_start_values(struct instance *);
+WITHIN enum status fail(struct instance *, const char *format, ...);
+WITHIN void warn(struct instance *, const char *format, ...);
+WITHIN const char *element_name(const struct variable *, int32_t element);
 
-enum status allow(struct instance *, const char *call, unsigned modes);
-enum status initialize(struct instance *);
-enum status finish_initialization(struct instance *, int model_exchange);
-enum status advance(struct instance *, double t, double h);
+WITHIN enum status allow(struct instance *, const char *call, unsigned modes);
+WITHIN enum status initialize(struct instance *);
+WITHIN enum status finish_initialization(struct instance *, int model_exchange);
+WITHIN enum status advance(struct instance *, double t, double h);
 
-enum status get_real(struct instance *, int32_t offset, int32_t size, double *);
-enum status set_real(struct instance *, const struct variable *, int32_t element, int32_t size,
-                     const double *);
-enum status get_integer(struct instance *, int32_t index, int64_t *);
-enum status set_integer(struct instance *, int32_t index, int64_t);
+WITHIN enum status get_real(struct instance *, int32_t offset, int32_t size, double *);
+WITHIN enum status set_real(struct instance *, const struct variable *, int32_t element,
+                            int32_t size, const double *);
+WITHIN enum status get_integer(struct instance *, int32_t index, int64_t *);
+WITHIN enum status set_integer(struct instance *, int32_t index, int64_t);
 
-enum status set_time(struct instance *, double);
-enum status get_states(struct instance *, double *, size_t n);
-enum status set_states(struct instance *, const double *, size_t n);
-enum status get_rates(struct instance *, double *, size_t n);
-enum status update_discrete(struct instance *, int *defined, double *next_time);
+WITHIN enum status set_time(struct instance *, double);
+WITHIN enum status get_states(struct instance *, double *, size_t n);
+WITHIN enum status set_states(struct instance *, const double *, size_t n);
+WITHIN enum status get_rates(struct instance *, double *, size_t n);
+WITHIN enum status update_discrete(struct instance *, int *defined, double *next_time);
 
-enum status begin_tangent(struct instance *);
-enum status seed_tangent(struct instance *, const struct variable *, int32_t element, double);
-enum status propagate_tangent(struct instance *);
-enum status read_tangent(struct instance *, const struct variable *, int32_t element, double *);
+WITHIN enum status begin_tangent(struct instance *);
+WITHIN enum status seed_tangent(struct instance *, const struct variable *, int32_t element,
+                                double);
+WITHIN enum status propagate_tangent(struct instance *);
+WITHIN enum status read_tangent(struct instance *, const struct variable *, int32_t element,
+                                double *);
 
-size_t serialized_size(void);
-void serialize(const struct data *, char *);
-enum status deserialize(struct instance *, const char *, size_t, struct data *);
+WITHIN size_t serialized_size(void);
+WITHIN void serialize(const struct data *, char *);
+WITHIN enum status deserialize(struct instance *, const char *, size_t, struct data *);
 
 #define ALLOWED(mode) (1u << (mode))
 #define RUNNING (ALLOWED(STEPPING) | ALLOWED(EVENT) | ALLOWED(CONTINUOUS))

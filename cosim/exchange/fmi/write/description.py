@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from importlib.metadata import version as installed
@@ -53,10 +54,11 @@ def describe(variable: Variable) -> str:
 
 
 def number(value: float) -> str:
-    """A number that reads back to the last bit."""
-    if math.isinf(value):
-        return "INF" if value > 0 else "-INF"
-    return repr(float(value))
+    """A number that reads back to the last bit.
+
+    Infinity is the largest number, which stands for it in our C too: not every tool reads INF.
+    """
+    return repr(math.copysign(sys.float_info.max, value) if math.isinf(value) else float(value))
 
 
 def _bytes(root: ET.Element) -> bytes:

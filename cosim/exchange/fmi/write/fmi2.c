@@ -76,8 +76,10 @@ fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean tolerance_defined, f
                                fmi2Real start, fmi2Boolean stop_defined, fmi2Real stop)
 {
     INSTANCE;
-    (void)tolerance_defined, (void)tolerance, (void)stop_defined, (void)stop;
+    (void)tolerance_defined, (void)tolerance;
     REQUIRE(ALLOWED(INSTANTIATED));
+    i->now.stops = stop_defined;
+    i->now.stop_time = stop;
     i->now.start_time = i->now.real[TIME] = start;
     return fmi2OK;
 }

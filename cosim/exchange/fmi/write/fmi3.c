@@ -107,8 +107,10 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolera
                                        fmi3Boolean stop_defined, fmi3Float64 stop)
 {
     INSTANCE;
-    (void)tolerance_defined, (void)tolerance, (void)stop_defined, (void)stop;
+    (void)tolerance_defined, (void)tolerance;
     REQUIRE(ALLOWED(INSTANTIATED));
+    i->now.stops = stop_defined;
+    i->now.stop_time = stop;
     i->now.start_time = i->now.real[TIME] = start;
     return (fmi3Status)initialize(i);
 }

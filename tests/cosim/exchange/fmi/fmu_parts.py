@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import casadi as ca
+import numpy as np
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.parameters import Parameter
@@ -51,6 +52,22 @@ class Turning(SymbolicComponent):
             outputs={"x": x},
             step=ca.SX.sym("dt"),
             time=t,
+        )
+
+
+class Share(SymbolicComponent):
+    """u as a part of a whole, which may be infinite."""
+
+    default_rate = Rate("0.1")
+
+    whole = Parameter(np.inf, infinite=True, doc="what 1 is divided by")
+    u = Input((), unit="1", default=1.0, doc="part")
+    y = Output((), unit="1", doc="share")
+
+    def build_model(self):
+        u, whole = ca.SX.sym("u"), ca.SX.sym("whole")
+        return Model(
+            "share", inputs={"u": u}, parameters={"whole": whole}, outputs={"y": u / whole}
         )
 
 

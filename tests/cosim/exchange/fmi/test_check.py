@@ -87,8 +87,8 @@ def found(spring, tmp_path, fmi=3, **changes):
         ),
         (
             "library",
-            [("core.c", "size_t serialized_size(void)", '__attribute__((visibility("default"))) size_t serialized_size(void)')],
-            "symbols besides FMI's: serialized_size",
+            [("core.c", "size_t serialized_size(void)", '__attribute__((visibility("default"))) int shown;\nsize_t serialized_size(void)')],
+            "symbols besides FMI's: shown",
         ),
         (
             "run",

@@ -10,9 +10,11 @@ import zipfile
 from pathlib import Path
 
 import casadi as ca
+import fmpy
 import fmu_parts
 import numpy as np
 import pytest
+from fmpy.model_description import read_build_description
 from fmu_helpers import OPEN_LOOP, without_evaluation
 
 import terrafix as tf
@@ -33,6 +35,7 @@ from terrafix.cosim.exchange.fmi.run.binding import (
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
 from terrafix.cosim.files.readers import read_system
+from terrafix.cosim.kernels.toolchain import working_compiler
 from terrafix.cosim.system.system import System
 
 COMPONENTS = (
@@ -412,7 +415,8 @@ def test_what_is_inside(exported, fmi):
     assert "read at the end of a step" in xml
     assert "Kalman" in page  # the equations of the model
     assert "frame e" in xml
-    assert 'start="INF' in xml.replace("INF INF", "INF")
+    assert "INF" not in xml.replace("INFORMATION", "")
+    assert "1.7976931348623157e+308" in xml
 
 
 def test_start_values_read_back_to_the_last_bit(exported):
@@ -455,6 +459,90 @@ def test_the_noise_key_is_that_of_python(tmp_path):
     delta_v = subject.get(instance, [subject.by_name["delta_v_b"]])
     assert delta_v == pytest.approx(5.916079783099616e-6 * np.sqrt(0.01) * drawn, rel=1e-12)
     instance.free()
+
+
+# ------------------------------------------------------------------ for other tools
+
+
+def from_sources(file, target):
+    """An FMU with the binary that a compiler makes of its sources, told nothing of visibility."""
+    folder = target.parent / f"{target.stem}_sources"
+    with zipfile.ZipFile(file) as archive:
+        archive.extractall(folder)
+    (configuration,) = read_build_description(str(folder))
+    (sources,) = configuration.sourceFileSets
+    command = [*working_compiler().command, "-shared", "-fPIC", *sources.sourceFiles]
+    (binary,) = (folder / "binaries").glob("*/*.so")
+    subprocess.run([*command, "-o", str(binary), "-lm"], cwd=folder / "sources", check=True)
+    with zipfile.ZipFile(target, "w") as archive:
+        for path in folder.rglob("*"):
+            archive.write(path, path.relative_to(folder))
+    return target
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="compiles for Linux")
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_compiled_from_its_sources(spring, tmp_path, fmi):
+    """The C library's `advance` is not called; in FMPy, the same bytes as of our binary."""
+    options = {"stop_time": 0.5, "output_interval": 0.01, "fmi_type": "CoSimulation"}
+    found, expected = (
+        fmpy.simulate_fmu(str(file), **options)
+        for file in (from_sources(spring(fmi), tmp_path / "compiled.fmu"), spring(fmi))
+    )
+    assert len(expected) == 51
+    assert found.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_a_step_past_the_stop_time_is_refused(spring, fmi):
+    """As FMI demands; up to it, steps are made, also to a stop time that is no multiple."""
+    subject = Subject(open_archive(spring(fmi)), CO_SIMULATION)
+    for stop in (0.05, 0.054):
+        instance = subject.instantiate()
+        none, zero, end = ctypes.c_double(0.0), ctypes.c_double(0.0), ctypes.c_double(stop)
+        if fmi == 2:
+            instance.call("SetupExperiment", 0, none, zero, 1, end)
+            instance.call("EnterInitializationMode")
+        else:
+            no, yes = ctypes.c_bool(False), ctypes.c_bool(True)
+            instance.call("EnterInitializationMode", no, none, zero, yes, end)
+        instance.finish()
+        for k in range(5):
+            instance.step(0.01 * k, 0.01)
+        with pytest.raises(
+            FmuError, match=r"DoStep returned Error: a step to t = 0.06 s is refused"
+        ):
+            instance.step(0.05, 0.01)
+        instance.free()
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_infinity_is_the_largest_number(tmp_path, fmi):
+    """FMI Library reads no INF. 1 / infinity is 0, where 1 / 1.8e308 is not."""
+    file = tmp_path / "share.fmu"
+    export_fmu(fmu_parts.Share(), file, fmi=fmi)
+    with zipfile.ZipFile(file) as archive:
+        xml = archive.read("modelDescription.xml").decode()
+    assert 'start="1.7976931348623157e+308"' in xml
+    for whole, share in ((None, 0.0), (sys.float_info.max, 0.0), (np.inf, 0.0), (4.0, 0.25)):
+        start = {} if whole is None else {"whole": whole}
+        fmu = Fmu(file=file, rate=Rate("0.1"), start=start)
+        assert outputs_of(fmu) == [share]
+    rows = fmpy.simulate_fmu(str(file), stop_time=0.2, output_interval=0.1, start_values={"u": 1.0})
+    assert rows["y"][-1] == 0.0
+    subject = Subject(open_archive(file), CO_SIMULATION)
+    instance = subject.started()
+    (found,) = subject.get(instance, [subject.by_name["whole"]])
+    assert found == sys.float_info.max == subject.by_name["whole"].start[0]
+    instance.free()
+
+
+def outputs_of(fmu):
+    """y of a component after a step."""
+    with System("s") as system:
+        system.add(fmu, "a")
+    system.record("r", ["a.y"])
+    return simulate(system, duration="0.1").dataset["a.y"].values[-1].tolist()
 
 
 # ------------------------------------------------------------------ bad input
