@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
+from terrafix.cosim.basics.units import UNDEFINED
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, FilePath, Flag, Parameter, Table
 from terrafix.cosim.declare.ports import (
@@ -146,7 +147,8 @@ class Fmu(Component):
 
     def _field(self, port: str, quantity: Quantity, frame: str | None) -> Field:
         unit, wanted = quantity.unit, self.given_parameters["units"].get(port)
-        if wanted is not None and unit not in ("1", wanted):
+        known = isinstance(unit, str) and not unit.endswith(UNDEFINED) and unit != "1"
+        if wanted is not None and (known or not isinstance(unit, str)) and unit != wanted:
             raise ConfigurationError(
                 f"'{self.name}.units' says {wanted} for '{port}', the FMU says {unit}\n"
                 "  leave it out: units are converted where ports are connected"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.basics.units import check_unit
+from terrafix.cosim.basics.units import SI_BASE, check_unit, unit_by_definition, unit_by_name
 from terrafix.cosim.exchange.fmi.run.archive import Archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
 from terrafix.cosim.memory.fields import Field, Unit
@@ -187,6 +187,7 @@ def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True)
 def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list[str]]:
     """Inputs, outputs and parameters, elements of arrays together."""
     wanted = ("input", "output", "parameter", "structuralParameter")
+    units = Units(archive)
     groups: dict[tuple[str, str], list[tuple[tuple[int, ...], Any]]] = {}
     left_out = []
     for variable in archive.description.modelVariables:
@@ -206,11 +207,11 @@ def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list
         shape = _extent([index for index, _ in members])
         same = len({(v.type, v.variability) for _, v in members}) == 1
         if shape is not None and same:
-            made = _quantity(name, shape, [v for _, v in members])
+            made = _quantity(name, shape, [v for _, v in members], units)
             made.base = min(min(index) for index, _ in members) if shape else 1
             quantities.append(made)
         else:
-            quantities += [_quantity(v.name, (), [v]) for _, v in members]
+            quantities += [_quantity(v.name, (), [v], units) for _, v in members]
     return quantities, left_out
 
 
@@ -226,11 +227,13 @@ def _extent(indices: Sequence[tuple[int, ...]]) -> tuple[int, ...] | None:
     return shape if list(indices) == full and low.max() <= 1 else None
 
 
-def _quantity(name: str, shape: tuple[int, ...], members: Sequence[Any]) -> Quantity:
+def _quantity(
+    name: str, shape: tuple[int, ...], members: Sequence[Any], units_of: Units
+) -> Quantity:
     first = members[0]
     if first.dimensions or first.shape:
         shape = tuple(int(n) for n in (first.shape or ()))
-    units = tuple(_unit(v) for v in members)
+    units = tuple(units_of(v) for v in members)
     unit: Unit = units[0] if len(set(units)) == 1 else units
     if len(shape) == 2 and not isinstance(unit, str):
         last = units[: shape[-1]]
@@ -248,17 +251,37 @@ def _quantity(name: str, shape: tuple[int, ...], members: Sequence[Any]) -> Quan
     )
 
 
-def _unit(variable: Any) -> str:
-    unit = variable.unit
-    if unit is None and variable.declaredType is not None:
-        unit = variable.declaredType.unit
-    if unit is None or unit in ("", "-"):
-        return "1"
-    try:
-        check_unit(unit)
-    except ConfigurationError:
-        return "1"
-    return str(unit)
+class Units:
+    """Units of an FMU's variables: what its UnitDefinitions say, and where they say nothing, SI."""
+
+    def __init__(self, archive: Archive) -> None:
+        self._own = archive.annotation is not None
+        self._defined = {u.name: u.baseUnit for u in archive.description.unitDefinitions}
+        self._read: dict[str, str] = {}
+
+    def __call__(self, variable: Any) -> str:
+        """The unit of a variable."""
+        name = variable.unit
+        if name is None and variable.declaredType is not None:
+            name = variable.declaredType.unit
+        if name in (None, "", "-", "1"):
+            return "1"
+        if name not in self._read:
+            self._read[name] = self._meaning(str(name))
+        return self._read[name]
+
+    def _meaning(self, name: str) -> str:
+        base = self._defined.get(name)
+        if base is not None and not self._own:
+            powers = {symbol: int(getattr(base, symbol)) for symbol in SI_BASE}
+            return unit_by_definition(name, float(base.factor), powers, float(base.offset))
+        if not self._own:
+            return unit_by_name(name)
+        try:
+            check_unit(name)
+        except ConfigurationError:
+            return "1"
+        return name
 
 
 def _starts(members: Sequence[Any]) -> list[float] | None:
