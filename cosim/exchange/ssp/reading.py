@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -537,8 +538,9 @@ def _starts(fmu: Fmu, values: Mapping[str, Any]) -> dict[str, Any]:
         if any(g is None for g in given):
             missing = names[[g is None for g in given].index(True)]
             raise ConfigurationError(f"its parameter set has no value for '{missing}'")
-        words = {"true": 1.0, "false": 0.0}
-        numbers = [words.get(g[0]) or float(words.get(g[0], g[0])) for g in given if g is not None]
+        numbers = [
+            _number(g[0], name) for g, name in zip(given, names, strict=True) if g is not None
+        ]
         unit = given[0][1] if given[0] is not None else None
         value: Any = numbers[0] if not quantity.shape else _nested(numbers, quantity.shape)
         own = quantity.unit if isinstance(quantity.unit, str) else "1"
@@ -552,4 +554,16 @@ def _starts(fmu: Fmu, values: Mapping[str, Any]) -> dict[str, Any]:
 def _nested(numbers: list[Any], shape: tuple[int, ...]) -> Any:
     import numpy as np
 
-    return np.reshape(numbers, shape).tolist()
+    return np.reshape(np.array(numbers, dtype=object), shape).tolist()
+
+
+def _number(text: str, name: str) -> float | int:
+    """A number of a parameter set, whole ones to the last digit."""
+    if text in ("true", "false"):
+        return int(text == "true")
+    with suppress(ValueError):
+        return int(text)
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigurationError(f"its parameter set gives '{name}' as '{text}'") from None

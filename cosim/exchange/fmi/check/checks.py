@@ -25,8 +25,9 @@ from terrafix.cosim.exchange.fmi.run.binding import (
     load_library,
     references,
 )
-from terrafix.cosim.exchange.fmi.run.reading import BOOLEAN, INTEGER, REAL
+from terrafix.cosim.exchange.fmi.run.reading import REAL
 from terrafix.cosim.exchange.fmi.run.remote import serve
+from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER
 
 CYCLES = 1000
 MOST_KNOWNS = 200

@@ -7,6 +7,7 @@ the loader after a thousand. Status and messages of an instance become `FmuError
 from __future__ import annotations
 
 import ctypes as ct
+import math
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
 from terrafix.cosim.exchange.fmi.run.archive import Archive
+from terrafix.cosim.exchange.fmi.run.whole import limits
 
 CO_SIMULATION, MODEL_EXCHANGE = "co-simulation", "model exchange"
 STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
@@ -40,6 +42,8 @@ _TYPES: dict[str, tuple[str, Any]] = {  # of the variable: (in function names, o
     "UInt64": ("UInt64", ct.c_uint64),
     "Boolean": ("Boolean", ct.c_bool),
 }
+
+_MOST_SINGLE = float(np.finfo(np.float32).max)
 
 
 class FmuError(TerrafixError):
@@ -299,11 +303,49 @@ class Instance:
         """Set variables of one type."""
         name, ctype = self._type(kind)
         flat = np.asarray(values).ravel().tolist()
-        convert: Any = float if ctype in (ct.c_double, ct.c_float) else int
-        converted = [convert(value) for value in flat]
+        if ctype is ct.c_double:
+            converted = flat
+        elif ctype is ct.c_float:
+            converted = self._singles(kind, vr, flat)
+        else:
+            converted = self._wholes(kind, vr, flat)
         array = (ctype * max(len(flat), 1))(*converted)
         sizes = () if self._version == 2 else (ct.c_size_t(len(flat)),)
         self.call(f"Set{name}", vr, ct.c_size_t(len(vr)), array, *sizes)
+
+    def _wholes(self, kind: str, vr: Any, values: list[Any]) -> list[int]:
+        low, high = limits(kind, self._version)
+        for k, value in enumerate(values):
+            if not low <= value <= high or value != int(value):
+                raise FmuError(
+                    f"'{self._name_of(kind, vr, k)}' ({kind}) is set to {value!r}; it takes "
+                    f"whole numbers from {low} to {high}"
+                )
+        return [int(value) for value in values]
+
+    def _singles(self, kind: str, vr: Any, values: list[Any]) -> list[float]:
+        for k, value in enumerate(values):
+            if math.isfinite(value) and abs(value) > _MOST_SINGLE:
+                raise FmuError(
+                    f"'{self._name_of(kind, vr, k)}' ({kind}) is set to {value!r}; it takes "
+                    f"numbers up to {_MOST_SINGLE:.7g}"
+                )
+        return values
+
+    def _name_of(self, kind: str, vr: Any, place: int) -> str:
+        """Name of the variable that a value among those of several references belongs to."""
+        of_kind = {
+            int(v.valueReference): v
+            for v in reversed(self.library.archive.description.modelVariables)
+            if v.type == kind
+        }
+        for reference in vr:
+            variable = of_kind.get(int(reference))
+            size = math.prod(int(n) for n in getattr(variable, "shape", None) or ())
+            if place < size:
+                return variable.name if variable is not None else f"value reference {reference}"
+            place -= size
+        return "a variable"
 
     # ------------------------------------------------------------------ co-simulation
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import UNDEFINED
@@ -37,6 +36,7 @@ from terrafix.cosim.exchange.fmi.run.reading import (
 )
 from terrafix.cosim.exchange.fmi.run.remote import RemoteFleet
 from terrafix.cosim.exchange.fmi.run.solvers import SOLVERS
+from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, MOST, cells, read_whole
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.memory.messages import MessageReader
 from terrafix.cosim.memory.slots import BundleView
@@ -162,16 +162,23 @@ class Fmu(Component):
             )
         return quantity.field(frame or other)
 
-    def _start_value(self, quantity: Quantity) -> FloatArray:
-        given = self._given.get(quantity.name)
+    def _start_value(self, quantity: Quantity) -> NDArray[Any]:
+        given: Any = self._given.get(quantity.name)
         start = given if given is not None else quantity.start
-        value = np.zeros(quantity.shape) if start is None else np.asarray(start, dtype=np.float64)
-        return value.reshape(quantity.shape)
+        dtype = np.int64 if quantity.kind in INTEGER else np.float64
+        if start is None:
+            return np.zeros(quantity.shape, dtype)
+        if quantity.kind == "UInt64" and (most := max(np.array(start, object).ravel())) > MOST:
+            raise ConfigurationError(
+                f"'{self.name}': '{quantity.name}' (UInt64) starts at {most}; a port holds at most "
+                f"{MOST}"
+            )
+        return np.asarray(start, dtype=dtype).reshape(quantity.shape)
 
-    def _read_starts(self) -> dict[str, FloatArray]:
+    def _read_starts(self) -> dict[str, NDArray[Any]]:
         """Values of ``start``, converted to the units of the variables."""
         known = self.settable()
-        values = {}
+        values: dict[str, NDArray[Any]] = {}
         for name, value in self.given_parameters["start"].items():
             if name not in known:
                 raise ConfigurationError(
@@ -179,6 +186,15 @@ class Fmu(Component):
                     f"  {nearest(name, known, what='it has')}"
                 )
             quantity = known[name]
+            if quantity.kind in (*INTEGER, *BOOLEAN):
+                values[name] = read_whole(
+                    value,
+                    quantity.kind,
+                    self.interface.archive.version,
+                    quantity.shape,
+                    where=f"'{self.name}.start.{name}'",
+                )
+                continue
             # nobody says what a foreign array's elements have in common
             reader = Parameter(
                 shape=quantity.shape, unit=quantity.unit, frame="of the FMU", infinite=True
@@ -192,7 +208,7 @@ class Fmu(Component):
         inputs = {q.name: q for p in ports if p.is_input for q, _ in p.fields.values()}
         return self.interface.parameters | inputs
 
-    def given_starts(self) -> dict[str, FloatArray]:
+    def given_starts(self) -> dict[str, NDArray[Any]]:
         """Values of ``start`` in the units of the variables."""
         return dict(self._given)
 
@@ -255,12 +271,12 @@ class Fmu(Component):
             if self.given_parameters["isolate"]
             else Fleet(setup, env.n_members)
         )
+        self._kinds = {(port, name): q.kind for port, name, q in (*read, *written)}
         self._sequence = {p.name: np.zeros(env.n_members, np.int64) for p in self._outputs}
         self._t, self._first = 0.0, True
         self._skipped = ~env.active
         for port, name, quantity in read:
-            columns = self._input_at[port, name]
-            self._fleet.inputs[:, columns] = self._start_value(quantity).ravel()
+            self._input_cells(port, name)[...] = self._start_value(quantity).ravel()
         self._take_inputs(finite=True)
         self._bind_copies()
         self._report(self._fleet.start(env.active.copy(), self._fresh_messages()))
@@ -274,7 +290,7 @@ class Fmu(Component):
             (
                 parameters[name].kind,
                 tuple(parameters[name].references),
-                tuple(float(v) for v in value.ravel()),
+                tuple(value.ravel().tolist()),
             )
             for name, value in self._given.items()
             if name in parameters
@@ -290,7 +306,7 @@ class Fmu(Component):
         for name, numbers in values.items():
             quantity = self.interface.parameters.get(name)
             if quantity is not None and name not in self._given:
-                each = tuple(float(v) for v in numbers)
+                each = tuple(np.asarray(numbers).tolist())
                 found.append((quantity.kind, tuple(quantity.references), each))
         return tuple(found)
 
@@ -304,30 +320,39 @@ class Fmu(Component):
 
     def _take_inputs(self, *, finite: bool = False, late: bool = True) -> None:
         """Copy inputs into the rows; only those that are known, and not those read at the start."""
-        fleet = self._fleet
-        assert fleet is not None
-        for (port, name), columns in self._input_at.items():
+        for port, name in self._input_at:
             if not late and self.ports[port].at == "start":
                 continue
             rows = self._view(port, name).reshape(self.n_members, -1)
+            target = self._input_cells(port, name)
             if finite:
                 known = np.isfinite(rows.astype(np.float64)).all(axis=1)
-                fleet.inputs[known, columns] = rows[known]
+                target[known] = rows[known]
             else:
-                fleet.inputs[:, columns] = rows
+                target[...] = rows
+
+    def _input_cells(self, port: str, name: str) -> NDArray[Any]:
+        """What the FMU will read, (n_members, size), in the type of the port."""
+        assert self._fleet is not None
+        key = port, name
+        return cells(self._fleet.inputs, self._kinds[key], self._input_at[key])
+
+    def _output_cells(self, port: str, name: str) -> NDArray[Any]:
+        """What the FMU has written."""
+        assert self._fleet is not None
+        key = port, name
+        return cells(self._fleet.outputs, self._kinds[key], self._output_at[key])
 
     def _bind_copies(self) -> None:
         """Pairs (target, source) of what is copied before and after each step."""
-        fleet = self._fleet
-        assert fleet is not None
         n = self.n_members
         self._copies = [
-            (fleet.inputs[:, columns], self._view(port, name).reshape(n, -1))
-            for (port, name), columns in self._input_at.items()
+            (self._input_cells(port, name), self._view(port, name).reshape(n, -1))
+            for port, name in self._input_at
         ]
         self._results = [
-            (self._view(port, name).reshape(n, -1), fleet.outputs[:, columns])
-            for (port, name), columns in self._output_at.items()
+            (self._view(port, name).reshape(n, -1), self._output_cells(port, name))
+            for port, name in self._output_at
             if self.ports[port].kind == "signal"
         ]
 
@@ -377,24 +402,22 @@ class Fmu(Component):
             assert port.sequence is not None
             values += [(port.t, view.t), (port.sequence, view.sequence)]
             for quantity, array in values:
-                chosen = np.asarray(array[rows], dtype=np.float64).reshape(len(rows), -1)
+                chosen = np.asarray(array[rows]).reshape(len(rows), -1)
                 sent.append(Message(quantity.kind, tuple(quantity.references), rows, chosen))
         return sent
 
     def _publish_messages(self) -> None:
         """Publish messages where their number has changed."""
-        fleet = self._fleet
-        assert fleet is not None
         for port in self._published:
-            number = fleet.outputs[:, self._output_at[port.name, "sequence"]][:, 0].astype(np.int64)
+            number = self._output_cells(port.name, "sequence")[:, 0].astype(np.int64)
             new = number > self._sequence[port.name]
             if not new.any():
                 continue
             self._sequence[port.name] = number
-            t = fleet.outputs[:, self._output_at[port.name, "t"]][:, 0]
+            t = self._output_cells(port.name, "t")[:, 0]
             writer = self.port_views[port.name]
             for name, (quantity, _) in port.fields.items():
-                rows = fleet.outputs[:, self._output_at[port.name, name]]
+                rows = self._output_cells(port.name, name)
                 writer.draft[name][...] = rows.reshape(self.n_members, *quantity.shape)
             writer.publish_draft(t, new)
 

@@ -1,6 +1,7 @@
 """Instances of one FMU, one for each member: started, stepped, saved and freed together.
 
-Values go in and out as rows of numbers, (n_members, width), all quantities side by side. A member
+Values go in and out as rows of numbers, (n_members, width), all quantities side by side; of whole
+numbers a row holds the 64 bits themselves (`cells`), so that none loses its last digit. A member
 whose instance fails is reported with what the FMU said; the others go on. `Fleet` runs here,
 `terrafix.cosim.exchange.fmi.run.remote.RemoteFleet` is the same in a process of its own.
 """
@@ -27,6 +28,7 @@ from terrafix.cosim.exchange.fmi.run.binding import (
     references,
 )
 from terrafix.cosim.exchange.fmi.run.solvers import Integrator
+from terrafix.cosim.exchange.fmi.run.whole import INTEGER, MOST, cells
 from terrafix.cosim.kernels import toolchain
 
 Failures = dict[int, str]
@@ -88,7 +90,7 @@ class Message:
     kind: str
     references: tuple[int, ...]
     rows: NDArray[np.int64]
-    values: FloatArray
+    values: NDArray[Any]
 
     def send(self, row: int, instance: Instance) -> None:
         """Set them on one member's instance, if they are meant for it."""
@@ -242,15 +244,19 @@ class Fleet:
 
     def _set_all(self, instance: Instance, row: int) -> None:
         for group in self.setup.inputs:
-            values = self.inputs[row, group.start : group.start + group.size]
+            columns = slice(group.start, group.start + group.size)
+            values = cells(self.inputs, group.kind, columns)[row]
             instance.set(group.kind, self._references[group], values)
 
     def _get_all(self, instance: Instance, row: int) -> None:
         for group in self.setup.outputs:
             values = instance.get(group.kind, self._references[group], group.size)
-            self.outputs[row, group.start : group.start + group.size] = values
-        if not np.isfinite(self.outputs[row]).all():
-            raise FmuError("an output is not finite")
+            if group.kind == "UInt64" and len(values) and int(values.max()) > MOST:
+                raise FmuError(f"an output (UInt64) is {values.max()}; a port holds at most {MOST}")
+            if group.kind not in INTEGER and not np.isfinite(values).all():
+                raise FmuError("an output is not finite")
+            columns = slice(group.start, group.start + group.size)
+            cells(self.outputs, group.kind, columns)[row] = values
 
     # ------------------------------------------------------------------ stepping
 

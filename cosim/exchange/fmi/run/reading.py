@@ -19,14 +19,10 @@ from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.basics.units import SI_BASE, check_unit, unit_by_definition, unit_by_name
 from terrafix.cosim.exchange.fmi.run.archive import Archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
+from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, whole_start
 from terrafix.cosim.memory.fields import Field, Unit
 
 REAL = ("Real", "Float64", "Float32")
-BOOLEAN = ("Boolean",)
-INTEGER = (
-    *("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16"),
-    *("Int32", "UInt32", "Int64", "UInt64"),
-)
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\d+)*)\]\Z")
 
 
@@ -44,7 +40,7 @@ class Quantity:
         Value references: one of an FMI 3 array, one for each scalar.
     shape : tuple of int
     unit : str or tuple of str
-    start : list of float or None
+    start : list of float or int, or None
     causality, variability : str
     doc : str
     base : int
@@ -56,7 +52,7 @@ class Quantity:
     references: list[int]
     shape: tuple[int, ...]
     unit: Unit = "1"
-    start: list[float] | None = None
+    start: list[float] | list[int] | None = None
     causality: str = "local"
     variability: str = "continuous"
     doc: str = ""
@@ -284,7 +280,7 @@ class Units:
         return name
 
 
-def _starts(members: Sequence[Any]) -> list[float] | None:
+def _starts(members: Sequence[Any]) -> list[float] | list[int] | None:
     texts = [v.start for v in members]
     if any(t is None for t in texts):
         return None
@@ -294,6 +290,9 @@ def _starts(members: Sequence[Any]) -> list[float] | None:
             words += text.split()
         else:
             words += [str(x) for x in np.asarray(text).ravel()]
+    kind = members[0].type
+    if kind in INTEGER:
+        return [whole_start(members[0].name, kind, w) for w in words]
     return [1.0 if w == "true" else 0.0 if w == "false" else float(w) for w in words]
 
 
