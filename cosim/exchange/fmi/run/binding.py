@@ -253,15 +253,16 @@ class Instance:
 
     # ------------------------------------------------------------------ life cycle
 
-    def begin(self, t: float) -> None:
-        """Enter initialization mode at a time [s]."""
+    def begin(self, t: float, tolerance: float | None = None) -> None:
+        """Enter initialization mode at a time [s]; with the tolerance of its own solver, if any."""
         none, time = ct.c_double(0.0), ct.c_double(t)
+        given = ct.c_double(tolerance or 0.0)
         if self._version == 2:
-            self.call("SetupExperiment", 0, none, time, 0, none)
+            self.call("SetupExperiment", int(bool(tolerance)), given, time, 0, none)
             self.call("EnterInitializationMode")
         else:
-            no = ct.c_bool(False)
-            self.call("EnterInitializationMode", no, none, time, no, none)
+            has, no = ct.c_bool(bool(tolerance)), ct.c_bool(False)
+            self.call("EnterInitializationMode", has, given, time, no, none)
 
     def finish(self) -> None:
         """Leave initialization mode."""

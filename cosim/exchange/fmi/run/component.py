@@ -65,7 +65,12 @@ class Fmu(Component):
     units = Table(doc="units of ports by name, where the FMU does not say")
     frames = Table(doc="frames of ports by name, where the FMU does not say")
     solver = Choice(SOLVERS, "cvode", doc="integrator of model exchange")
-    tolerance = Parameter(1e-10, positive=True, doc="relative, of that integrator")
+    tolerance = Parameter(
+        0.0,
+        minimum=0.0,
+        doc="relative, of that integrator (0: 1e-10), or handed on to the FMU's own in "
+        "co-simulation (0: what its default experiment says)",
+    )
     isolate = Flag(False, doc="run it in a process of its own: slower, but its crash is survived")
     time_limit = Parameter(
         60.0, unit="s", positive=True, doc="longest answer of an isolated FMU, in real time"
@@ -113,6 +118,14 @@ class Fmu(Component):
         if found.left_out:
             notes += (f"{', '.join(found.left_out)} cannot be connected: no numbers",)
         self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
+
+    def tolerance_of_solver(self) -> float | None:
+        """What is set, or in co-simulation what the FMU's default experiment says."""
+        if given := float(self.given_parameters["tolerance"]):
+            return given
+        experiment = self.interface.archive.description.defaultExperiment
+        own = None if experiment is None else experiment.tolerance
+        return float(own) if own and self.interface.kind == CO_SIMULATION else None
 
     def _default_period(self) -> Fraction | None:
         experiment = self.interface.archive.description.defaultExperiment
@@ -263,7 +276,7 @@ class Fmu(Component):
             self._start_settings(),
             self._identities(),
             self.given_parameters["solver"],
-            float(self.given_parameters["tolerance"]),
+            self.tolerance_of_solver(),
         )
         limit = float(self.given_parameters["time_limit"])
         self._fleet = (
@@ -373,7 +386,8 @@ class Fmu(Component):
                 skipped = np.flatnonzero(gone).tolist()
                 self._skipped |= gone
         messages = self._fresh_messages() if self._messages else ()
-        failures = fleet.step(self._t, dt, messages, skipped)
+        # not dt: the FMU must find the end of its step at t_now + h, to the last bit
+        failures = fleet.step(self._t, t - self._t, messages, skipped)
         self._t = t
         if failures:
             self._report(failures)

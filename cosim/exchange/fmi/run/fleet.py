@@ -33,6 +33,7 @@ from terrafix.cosim.kernels import toolchain
 
 Failures = dict[int, str]
 """Row of a member to what went wrong."""
+MODEL_EXCHANGE_TOLERANCE = 1e-10
 _DOUBLE = ("Real", "Float64")
 _STEP, _NOT_FINITE = 2, 4  # of `enum failure` in driver.c
 _REASONS = {
@@ -69,7 +70,8 @@ class Setup:
     starts : tuple of (str, tuple of int, tuple of float)
         Type, value references and values set before initialization.
     solver : str
-    tolerance : float
+    tolerance : float or None
+        Of the integrator in model exchange; in co-simulation handed on to the FMU, if there is one.
     """
 
     file: str
@@ -80,7 +82,7 @@ class Setup:
     starts: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
     each: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
     solver: str = "cvode"
-    tolerance: float = 1e-10
+    tolerance: float | None = None
 
 
 @dataclass(frozen=True)
@@ -231,14 +233,19 @@ class Fleet:
             instance.set(kind, references(vr), values)
         for kind, vr, values in self.setup.each:
             instance.set(kind, references(vr), values[row])
-        instance.begin(0.0)
+        tolerance = self.setup.tolerance
+        instance.begin(0.0, tolerance if self.setup.kind == CO_SIMULATION else None)
         self._set_all(instance, row)
         for message in messages:
             message.send(row, instance)
         instance.finish()
         if self.setup.kind != CO_SIMULATION:
             self._integrators[row] = Integrator(
-                instance, self.archive, 0.0, self.setup.solver, self.setup.tolerance
+                instance,
+                self.archive,
+                0.0,
+                self.setup.solver,
+                tolerance or MODEL_EXCHANGE_TOLERANCE,
             )
         self._get_all(instance, row)
 

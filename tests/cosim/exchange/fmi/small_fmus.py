@@ -159,7 +159,8 @@ def small_fmu(
         fixed = fixed or ("" if real else ' variability="discrete"')
         start = "" if v.start is None else f' start="{v.start}"'
         unit = f' unit="{v.unit}"' if v.unit is not None else ""
-        more = f" {v.attributes}" * bool(v.attributes)
+        exact = v.causality == "output" and v.start is not None
+        more = f" {v.attributes}" * bool(v.attributes) + ' initial="exact"' * exact
         elements.append(
             f"<ScalarVariable {shared}{fixed}{more}><{kind}{unit}{start}/></ScalarVariable>"
             if fmi == 2
