@@ -123,6 +123,14 @@ EXPORT const char *fmi2GetVersion(void) { return "2.0"; }
 EXPORT const char *fmi3GetVersion(void) { return "3.0"; }
 """
 
+_REFUSED = (
+    *("SetRealInputDerivatives", "GetRealOutputDerivatives", "CancelStep", "GetStatus"),
+    *("GetRealStatus", "GetIntegerStatus", "GetBooleanStatus", "GetStringStatus", "GetFMUstate"),
+    *("SetFMUstate", "FreeFMUstate", "SerializedFMUstateSize", "SerializeFMUstate"),
+    *("DeSerializeFMUstate", "GetDirectionalDerivative"),
+)
+"""Functions of FMI 2 that are there and return an error, unless `globals_` has them."""
+
 
 @dataclass
 class Variable:
@@ -185,6 +193,8 @@ def small_fmu(
         + f"<ModelVariables>{''.join(elements)}</ModelVariables>"
         f"<ModelStructure>{listed}</ModelStructure></fmiModelDescription>"
     )
+    refused = [n for n in _REFUSED if f"fmi2{n}(" not in globals_]
+    globals_ += "".join(f"EXPORT int fmi2{n}(void *m) {{ return 3; }}\n" for n in refused)
     text = _C.replace("GLOBALS", globals_).replace("STARTS", " ".join(starts))
     text = text.replace("ENTER", enter).replace("STEP", step)
     host = host_platform()
