@@ -82,24 +82,28 @@ class _EventInfo2(ct.Structure):
 
 
 _messages: dict[int, list[str]] = {}
+HEARD: list[tuple[int, int, str]] = []
+"""What instances logged: of which environment, with which status, what; until a fleet takes it."""
+_MOST_HEARD = 1000
 
 
-def _note(environment: int | None, category: bytes | None, text: bytes | None) -> None:
+def _note(environment: int | None, status: int, text: bytes | None) -> None:
     said = (text or b"").decode(errors="replace").strip()
     found = _messages.setdefault(environment or 0, [])
     if said and len(found) < 100:
         found.append(said)
-    del category
+    if said and len(HEARD) < _MOST_HEARD:
+        HEARD.append((environment or 0, int(status), said))
 
 
 def _log_of_fmi2(environment: Any, name: Any, status: Any, category: Any, text: Any) -> None:
-    del name, status
-    _note(environment, category, text)
+    del name, category
+    _note(environment, status, text)
 
 
 def _log_of_fmi3(environment: Any, status: Any, category: Any, text: Any) -> None:
-    del status
-    _note(environment, category, text)
+    del category
+    _note(environment, status, text)
 
 
 _log2 = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_char_p, ct.c_int, ct.c_char_p, ct.c_char_p)(
@@ -198,7 +202,7 @@ class Instance:
     def __init__(self, library: Library, name: str) -> None:
         self.library = library
         self._version = library.version
-        self._environment = Instance._next
+        self._environment = self.environment = Instance._next
         Instance._next += 1
         _messages[self._environment] = []
         self.pointer: ct.c_void_p | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -26,12 +28,13 @@ from terrafix.cosim.declare.ports import (
     Port,
 )
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
-from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
+from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE, STATUS
 from terrafix.cosim.exchange.fmi.run.fleet import Failures, Fleet, Group, Message, Setup
 from terrafix.cosim.exchange.fmi.run.reading import (
     ImportedPort,
     Interface,
     Quantity,
+    observed,
     read_interface,
 )
 from terrafix.cosim.exchange.fmi.run.remote import RemoteFleet
@@ -40,6 +43,10 @@ from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, MOST, cells,
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.memory.messages import MessageReader
 from terrafix.cosim.memory.slots import BundleView
+
+_log = logging.getLogger(__name__)
+MOST_LOGGED = 20
+"""Messages of one FMU that are shown."""
 
 
 class Fmu(Component):
@@ -64,6 +71,7 @@ class Fmu(Component):
     start = Table(doc="parameters and start values of inputs by name, with units")
     units = Table(doc="units of ports by name, where the FMU does not say")
     frames = Table(doc="frames of ports by name, where the FMU does not say")
+    observe = Table(doc='local variables and parameters that outputs show: { height = "body.h" }')
     solver = Choice(SOLVERS, "cvode", doc="integrator of model exchange")
     tolerance = Parameter(
         0.0,
@@ -101,6 +109,7 @@ class Fmu(Component):
                 else archive.description.modelExchange
             ).modelIdentifier
         )
+        self._observe()
         self._given = self._read_starts()
         self.ports = {port.name: self._port(port) for port in found.ports}
         for table in ("units", "frames"):
@@ -118,6 +127,24 @@ class Fmu(Component):
         if found.left_out:
             notes += (f"{', '.join(found.left_out)} cannot be connected: no numbers",)
         self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
+
+    def _observe(self) -> None:
+        """Add an output for each variable that `observe` names."""
+        interface = self.interface
+        taken = {port.name for port in interface.ports}
+        for name, variable in self.given_parameters["observe"].items():
+            where = f"'{self.name}.observe.{name}'"
+            if not re.fullmatch(r"[A-Za-z]\w*", name) or name in taken:
+                why = "is a port of the FMU" if name in taken else "is no name of a port"
+                raise ConfigurationError(f"{where}: '{name}' {why}\n  choose another name")
+            quantity = observed(
+                interface.archive,
+                str(variable),
+                arrays=self.given_parameters["arrays"],
+                where=where,
+            )
+            port = ImportedPort(name, "signal", False, None, {"": (quantity, None)})
+            interface.ports.append(port)
 
     def tolerance_of_solver(self) -> float | None:
         """What is set, or in co-simulation what the FMU's default experiment says."""
@@ -286,13 +313,15 @@ class Fmu(Component):
         )
         self._kinds = {(port, name): q.kind for port, name, q in (*read, *written)}
         self._sequence = {p.name: np.zeros(env.n_members, np.int64) for p in self._outputs}
-        self._t, self._first = 0.0, True
+        self._t, self._first, self._logged = 0.0, True, 0
         self._skipped = ~env.active
         for port, name, quantity in read:
             self._input_cells(port, name)[...] = self._start_value(quantity).ravel()
         self._take_inputs(finite=True)
         self._bind_copies()
-        self._report(self._fleet.start(env.active.copy(), self._fresh_messages()))
+        failures = self._fleet.start(env.active.copy(), self._fresh_messages())
+        self._show_log(self._fleet.take_log(), failures)
+        self._report(failures)
         for target, source in self._results:
             target[...] = source
         self._publish_messages()
@@ -389,11 +418,31 @@ class Fmu(Component):
         # not dt: the FMU must find the end of its step at t_now + h, to the last bit
         failures = fleet.step(self._t, t - self._t, messages, skipped)
         self._t = t
+        if said := fleet.take_log():
+            self._show_log(said, failures)
         if failures:
             self._report(failures)
         for target, source in self._results:
             target[...] = source
         self._publish_messages()
+
+    def _show_log(self, said: Sequence[tuple[int, int, str]], failures: Failures) -> None:
+        """Show what the FMU logged, with the member; not what a failure quotes."""
+        for row, status, text in said:
+            if text in failures.get(row, ""):
+                continue
+            level = logging.WARNING if status > 0 else logging.INFO
+            self._logged += level == logging.WARNING
+            if level == logging.WARNING and self._logged > MOST_LOGGED:
+                continue
+            what = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
+            member = self.environment.members[row]
+            path = self.environment.path
+            _log.log(
+                level, "'%s', member %d, t = %.9g s: %s: %s", path, member, self._t, what, text
+            )
+            if self._logged == MOST_LOGGED:
+                _log.warning("'%s': further messages of this FMU are not shown", path)
 
     def _report(self, failures: Failures) -> None:
         for row, text in failures.items():

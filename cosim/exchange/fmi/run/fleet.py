@@ -22,6 +22,7 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import (
     CO_SIMULATION,
+    HEARD,
     FmuError,
     Instance,
     load_library,
@@ -377,6 +378,15 @@ class Fleet:
                 f"fmi{self.library.version}{_REASONS[code]}{instance.said()}"
             )  # fmt: skip
             found[row] = what
+        return found
+
+    def take_log(self) -> Sequence[tuple[int, int, str]]:
+        """What the FMU logged since this was last asked: row, status as FMI numbers it, text."""
+        if not HEARD:
+            return ()
+        rows = {i.environment: row for row, i in enumerate(self.instances) if i is not None}
+        found = [(rows[e], status, text) for e, status, text in HEARD if e in rows]
+        HEARD[:] = [each for each in HEARD if each[0] not in rows]
         return found
 
     # ------------------------------------------------------------------ state

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import SI_BASE, check_unit, unit_by_definition, unit_by_name
 from terrafix.cosim.exchange.fmi.run.archive import Archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
@@ -180,14 +180,45 @@ def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True)
 # --------------------------------------------------------------------------------- variables
 
 
-def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list[str]]:
+CONNECTED = ("input", "output")
+PARAMETERS = ("parameter", "structuralParameter")
+
+
+def observed(archive: Archive, name: str, *, arrays: bool, where: str) -> Quantity:
+    """A local variable or parameter by its name, whole or one element; `where` names who asks.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is none of numbers.
+    """
+    wanted = ("local", "calculatedParameter", *PARAMETERS)
+    for together in (True, False) if arrays else (False,):
+        for quantity in _quantities(archive, arrays=together, wanted=wanted)[0]:
+            if quantity.name == name:
+                return quantity
+    known = {v.name: v for v in archive.description.modelVariables}
+    if name not in known:
+        raise ConfigurationError(
+            f"{where}: the FMU has no variable '{name}'\n  {nearest(name, known, what='it has')}"
+        )
+    variable = known[name]
+    raise ConfigurationError(
+        f"{where}: '{name}' is {variable.causality or 'local'} of type {variable.type}; it takes "
+        "local variables and parameters that are numbers"
+    )
+
+
+def _quantities(
+    archive: Archive, *, arrays: bool, wanted: Sequence[str] = (*CONNECTED, *PARAMETERS)
+) -> tuple[list[Quantity], list[str]]:
     """Inputs, outputs and parameters, elements of arrays together."""
-    wanted = ("input", "output", "parameter", "structuralParameter")
     units = Units(archive)
     groups: dict[tuple[str, str], list[tuple[tuple[int, ...], Any]]] = {}
     left_out = []
     for variable in archive.description.modelVariables:
-        if variable.causality not in wanted:
+        causality = variable.causality or "local"
+        if causality not in wanted:
             continue
         if variable.type not in (*REAL, *INTEGER, *BOOLEAN):
             if variable.causality in ("input", "output"):
@@ -196,7 +227,7 @@ def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list
         match = None if not arrays or variable.dimensions else _ELEMENT.match(variable.name)
         name = match[1] if match else variable.name
         index = tuple(int(i) for i in match[2].split(",")) if match else ()
-        groups.setdefault((name, variable.causality), []).append((index, variable))
+        groups.setdefault((name, causality), []).append((index, variable))
     quantities = []
     for (name, _), members in groups.items():
         members.sort(key=lambda pair: pair[0])

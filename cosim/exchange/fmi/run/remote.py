@@ -149,6 +149,7 @@ class RemoteFleet:
         self.inputs = np.zeros((n_members, sum(g.size for g in setup.inputs)))
         self.outputs = np.zeros((n_members, sum(g.size for g in setup.outputs)))
         self.driven = False
+        self._log: Sequence[tuple[int, int, str]] = ()
         self._limit = limit
         self._worker = Worker("terrafix.cosim.exchange.fmi.run.remote", f"the FMU '{setup.file}'")
         self._worker.call("make", setup, n_members, limit=FIRST_LIMIT)
@@ -168,9 +169,15 @@ class RemoteFleet:
         return self._exchange("step", t, h, messages, skipped)
 
     def _exchange(self, name: str, *arguments: Any) -> Failures:
-        failures, outputs = self._worker.call(name, self.inputs, *arguments, limit=self._limit)
+        answer = self._worker.call(name, self.inputs, *arguments, limit=self._limit)
+        failures, outputs, self._log = answer
         self.outputs[...] = outputs
         return dict(failures)
+
+    def take_log(self) -> Sequence[tuple[int, int, str]]:
+        """As `Fleet.take_log`."""
+        found, self._log = self._log, ()
+        return found
 
     def save(self) -> list[bytes]:
         """As `Fleet.save`."""
@@ -199,7 +206,7 @@ def main() -> None:
         def call(inputs: NDArray[np.float64], *arguments: Any) -> Any:
             fleet[0].inputs[...] = inputs
             failures = getattr(fleet[0], name)(*arguments)
-            return failures, fleet[0].outputs
+            return failures, fleet[0].outputs, fleet[0].take_log()
 
         return call
 
