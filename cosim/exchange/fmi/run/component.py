@@ -441,7 +441,7 @@ class Fmu(Component):
             _log.log(
                 level, "'%s', member %d, t = %.9g s: %s: %s", path, member, self._t, what, text
             )
-            if self._logged == MOST_LOGGED:
+            if level == logging.WARNING and self._logged == MOST_LOGGED:
                 _log.warning("'%s': further messages of this FMU are not shown", path)
 
     def _report(self, failures: Failures) -> None:
