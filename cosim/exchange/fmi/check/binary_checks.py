@@ -60,7 +60,8 @@ def required(binary: Any) -> set[str]:
         return {str(name) for name in binary.libraries}
     if isinstance(binary, lief.PE.Binary):
         return {str(i.name) for i in binary.imports}
-    return {str(x.name) for x in binary.libraries if "/" in str(x.name)}
+    own = lief.MachO.LoadCommand.TYPE.ID_DYLIB  # the name that the library has itself
+    return {str(x.name) for x in binary.libraries if "/" in str(x.name) and x.command != own}
 
 
 def glibc(binary: Any) -> tuple[int, int] | None:

@@ -14,7 +14,7 @@ from small_fmus import Variable, small_fmu
 
 from terrafix.cli import main
 from terrafix.cosim.exchange.fmi.check import check
-from terrafix.cosim.exchange.fmi.check.binary_checks import _SYSTEM, parse
+from terrafix.cosim.exchange.fmi.check.binary_checks import _SYSTEM, parse, required
 from terrafix.cosim.exchange.fmi.check.binary_checks import exported as exported_names
 from terrafix.cosim.exchange.fmi.check.check import check_fmu
 
@@ -231,8 +231,10 @@ def test_scheduled_execution_is_said_not_to_be_checked(tmp_path):
 def test_libraries_of_windows_and_symbols_of_mac_os():
     """FMPy's own binaries: shell32 and such are Windows', and a Mach-O's symbol table is read."""
     root = Path(fmpy.__file__).parent
-    dylib = next(root.rglob("*.dylib"))
-    assert exported_names(parse(dylib))
+    dylib = parse(next(root.rglob("logging.dylib")))
+    assert exported_names(dylib)
+    assert required(dylib) == {"/usr/lib/libSystem.B.dylib"}  # and not its own name
+    assert _SYSTEM.search("/usr/lib/libSystem.B.dylib")
     for name in ("SHELL32.dll", "ole32.dll", "WS2_32.dll", "api-ms-win-crt-math-l1-1-0.dll"):
         assert _SYSTEM.search(name)
     assert not _SYSTEM.search("cvodes.dll")
