@@ -3,14 +3,20 @@
 A thin door to Pint, loaded on first need: equal unit texts never need it. Angle is a dimension
 here, so that a rotation is not taken for a frequency: 1 Hz of a wheel is 6.28 rad/s, of a filter's
 pole 1/s. Elsewhere the radian alone may be left out: rad is 1, N m/rad is N m.
+
+A unit that a file defines carries its definition, since its name is a label that another file may
+use otherwise: ``kmph = 0.27778 m/s``. One that is named and nowhere defined is ``kmph = ?``, and
+fits itself alone.
 """
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib import resources
+from itertools import count
 from typing import Any
 
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -34,6 +40,22 @@ def _registry() -> Any:
     return registry
 
 
+_DEFINED = re.compile(r"(.+?) = (?:\?|(\S+)(?: ([^+?]+?))?(?: \+ (\S+))?)")
+_numbers = count()
+
+
+def _define(match: re.Match[str]) -> str:
+    """Tell Pint of a unit with its definition; its name there."""
+    _, factor, base, offset = match.groups()
+    name = f"defined_unit_{next(_numbers)}"
+    if factor is None:
+        _registry().define(f"{name} = [dimension_of_{name}]")
+    else:
+        shift = f"; offset: {float(offset)!r}" if offset else ""
+        _registry().define(f"{name} = {float(factor)!r} * {base or 'dimensionless'}{shift}")
+    return name
+
+
 _ROOT = re.compile(r"\bsqrt\(([^()]*)\)")
 
 
@@ -41,6 +63,8 @@ _ROOT = re.compile(r"\bsqrt\(([^()]*)\)")
 def _unit(text: str) -> Any:
     name = "dimensionless" if text in DIMENSIONLESS else _ROOT.sub(r"(\1)^0.5", text)
     try:
+        if defined := _DEFINED.fullmatch(text):
+            name = _define(defined)
         return _registry().Unit(name)
     except Exception as error:  # pint raises many types for text it cannot read
         raise ConfigurationError(
@@ -92,6 +116,9 @@ def _without_radians(unit: Any) -> Any:
 def difference(source: str, target: str) -> str:
     """Say that two units differ in dimension, and where a mistake is common, the way out."""
     text = f"the units differ: {source} is not {target}"
+    for unit in (source, target):
+        if unit.endswith(UNDEFINED):
+            return f"{text}\n  nobody defines {unit_label(unit)}: say which unit it is"
     a, b = _unit(source), _unit(target)
     if _differ_by_angle(a, b):
         if _is_rate(a, b):
@@ -178,7 +205,8 @@ def base_units(text: str) -> tuple[float, dict[str, int]] | None:
             reduced = {"radian": 1.0}
         else:
             quantity = _registry().Quantity(1.0, name).to_root_units()
-            factor *= float(quantity.magnitude) ** power
+            zero = _registry().Quantity(0.0, name).to_root_units().magnitude
+            factor *= float(quantity.magnitude - zero) ** power
             reduced = dict(quantity.unit_items())
             if not reduced and name in ("degree", "arcminute", "arcsecond", "milliradian"):
                 reduced = {"radian": 1.0}
@@ -190,3 +218,104 @@ def base_units(text: str) -> tuple[float, dict[str, int]] | None:
             symbol = _BASE_UNITS[base]
             exponents[symbol] = exponents.get(symbol, 0) + int(each * power)
     return factor, {symbol: power for symbol, power in exponents.items() if power}
+
+
+def base_offset(text: str) -> float:
+    """What zero is in SI base units: 273.15 of degC, 0 of most."""
+    try:
+        return float(_registry().Quantity(0.0, _unit(text)).to_root_units().magnitude)
+    except ValueError:  # Pint adds no offset within a compound unit
+        return 0.0
+
+
+# ------------------------------------------------------------- units that files define
+
+SI_BASE = tuple(_BASE_UNITS.values())
+UNDEFINED = " = ?"
+_OTHER_NAMES = {"Ohm": "ohm", "\N{OHM SIGN}": "ohm", "\N{GREEK CAPITAL LETTER OMEGA}": "ohm"}
+_OTHER_NAMES |= {"rev": "revolution"}
+_METRIC = (
+    *("m", "g", "s", "A", "K", "mol", "cd", "rad", "sr", "Hz", "N", "Pa", "W", "J", "C", "V", "F"),
+    *("Ohm", "S", "Wb", "T", "H", "lm", "lx", "Bq", "Gy", "Sv", "kat", "l", "L", "bar", "t", "eV"),
+)
+_NOT_METRIC = ("min", "h", "d", "deg", "degC", "degF", "rev", "rpm", "u", "%")
+_PREFIXES = ("", *"yzafpnumcdhkMGTPEZY", "da")
+_SYMBOL = re.compile(r"([^\W\d_]+|%)(?:\^?([+-]?\d{1,2}))?")
+_DANGEROUS = re.compile(r"\*\*|\^[^A-Za-z]*\^|\d{4}|[^\w%./*^()+ \-]|.{101}")
+
+
+def unit_label(text: str) -> str:
+    """The name of a unit without its definition."""
+    return text.partition(" = ")[0]
+
+
+def unit_by_definition(
+    label: str, factor: float, powers: Mapping[str, int], offset: float = 0.0
+) -> str:
+    """Unit of a file that says what its label means: ``factor`` times SI base units plus an offset.
+
+    The label, as we write it, where it means that here too (``m/s^2`` for Modelica's m/s2; the
+    radian may be left out by the definition); otherwise the label with its definition.
+    """
+    wanted = {symbol: power for symbol, power in powers.items() if power}
+    for text in (label, _translated(label)):
+        if not _DANGEROUS.search(text) and _means(text, factor, wanted, offset):
+            return text
+    above, below = (
+        " ".join(f"{s}^{abs(p)}" if abs(p) > 1 else s for s, p in wanted.items() if p * sign > 0)
+        for sign in (1, -1)
+    )
+    base = f"{above or '1'}/({below})" if " " in below else f"{above or '1'}/{below}"
+    base = base if below else above
+    name = " ".join(label.replace("=", " ").split())
+    return f"{name} = {factor!r}{' ' * bool(base)}{base}" + f" + {offset!r}" * bool(offset)
+
+
+def _means(text: str, factor: float, powers: Mapping[str, int], offset: float) -> bool:
+    try:
+        found = base_units(text)
+        shift = base_offset(text)
+    except ConfigurationError:
+        return False
+    if found is None:
+        return False
+    own, own_powers = found
+    if "rad" not in powers:
+        own_powers.pop("rad", None)
+    close = abs(own - factor) <= 1e-9 * abs(own) and abs(shift - offset) <= 1e-9 * abs(shift)
+    return close and own_powers == dict(powers)
+
+
+def unit_by_name(label: str) -> str:
+    """Unit of a file that says its name alone: of SI in Modelica's spelling or ours.
+
+    Anything else is not guessed; it fits itself alone.
+    """
+    if label in DIMENSIONLESS:
+        return "1"
+    rest = _SYMBOL.sub(lambda m: "" if _is_known(m[1]) else "?", label)
+    text = _translated(label)
+    if not _DANGEROUS.search(label) and re.fullmatch(r"[1/.*^() +-]*", rest):
+        try:
+            check_unit(text)
+        except ConfigurationError:
+            pass
+        else:
+            return text
+    return f"{' '.join(label.replace('=', ' ').split())}{UNDEFINED}"
+
+
+def _is_known(symbol: str) -> bool:
+    return symbol in _NOT_METRIC or any(
+        symbol == f"{prefix}{unit}" for prefix in _PREFIXES for unit in _METRIC
+    )
+
+
+def _translated(label: str) -> str:
+    """Modelica's ``kg.m2/s-1`` as we write it: ``kg m^2/s^-1``."""
+
+    def one(match: re.Match[str]) -> str:
+        power = f"^{match[2]}" if match[2] else ""
+        return f"{_OTHER_NAMES.get(match[1], match[1])}{power}"
+
+    return _SYMBOL.sub(one, label.strip()).replace(".", " ")

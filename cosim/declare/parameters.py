@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
-from terrafix.cosim.basics.units import conversion_factor, difference, split_quantity
+from terrafix.cosim.basics.units import conversion_factor, difference, split_quantity, unit_label
 from terrafix.cosim.declare.ports import Declaration, written
 from terrafix.cosim.memory.fields import Unit, quoted
 
@@ -208,6 +208,8 @@ class Parameter(Setting[FloatArray]):
             raise ConfigurationError(
                 f"{where} has elements of different units {self.unit_text()}; give bare SI numbers"
             )
+        if unit == unit_label(self.unit):  # as the file that defines it has it
+            return array
         try:
             factor = conversion_factor(unit, self.unit)
         except ConfigurationError as error:

@@ -18,7 +18,7 @@ from terrafix.cosim.basics.clock import Rate, text_seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.files import writable_target
 from terrafix.cosim.basics.scratch import scratch
-from terrafix.cosim.basics.units import base_units
+from terrafix.cosim.basics.units import base_offset, base_units
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.fmi.run.reading import ImportedPort, Interface, read_interface
@@ -392,6 +392,8 @@ def _write_units(parent: ET.Element, names: set[str]) -> None:
             attributes = {k: str(p) for k, p in known[1].items()}
             if known[0] != 1.0:
                 attributes["factor"] = number(known[0])
+            if offset := base_offset(name):
+                attributes["offset"] = number(offset)
         ET.SubElement(unit, tag(SSC, "BaseUnit"), attributes)
 
 

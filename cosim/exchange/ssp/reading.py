@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -20,10 +21,18 @@ from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError, nearest
 from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.basics.scratch import scratch_folder
+from terrafix.cosim.basics.units import (
+    SI_BASE,
+    UNDEFINED,
+    conversion_factor,
+    unit_by_definition,
+    unit_by_name,
+    unit_label,
+)
 from terrafix.cosim.exchange.fmi.run.archive import checked_xml, unpack
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.ssp.linear import Linear
-from terrafix.cosim.exchange.ssp.names import OSP, OWN, SSD, SSV, tag
+from terrafix.cosim.exchange.ssp.names import OSP, OWN, SSC, SSD, SSV, tag
 from terrafix.cosim.files.choices import Settings
 from terrafix.cosim.files.writing import system_text
 from terrafix.cosim.system.system import System
@@ -41,6 +50,7 @@ class _Link:
     target: End
     factor: float = 1.0
     offset: float = 0.0
+    converted: bool = True
 
 
 @dataclass
@@ -51,6 +61,7 @@ class _Part:
     source: str
     starts: dict[str, Any] = field(default_factory=dict)
     rate: Rate | None = None
+    units: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -198,28 +209,32 @@ class _Reader:
 
     def _collect(self, system: ET.Element, prefix: str, into: _Structure) -> None:
         """Gather components and connections, following systems within down to components."""
-        joints: list[tuple[End, End, float, float]] = []
+        joints: list[_Link] = []
         self._gather(system, prefix, into, joints)
-        incoming = {target: (source, f, o) for source, target, f, o in joints}
-        for source, target, factor, offset in joints:
+        incoming = {j.target: j for j in joints}
+        for joint in joints:
+            target = joint.target
             if target[0] not in into.parts:
                 continue
-            origin, gain, shift = source, factor, offset
+            origin, gain, shift = joint.source, joint.factor, joint.offset
+            converted = joint.converted
             seen = {target}
             while origin[0] not in into.parts and origin in incoming and origin not in seen:
                 seen.add(origin)
-                origin, f, o = incoming[origin]
-                gain, shift = gain * f, gain * o + shift
+                before = incoming[origin]
+                origin = before.source
+                gain, shift = gain * before.factor, gain * before.offset + shift
+                converted &= before.converted
             if origin[0] in into.parts:
-                into.links.append(_Link(origin, target, gain, shift))
+                into.links.append(_Link(origin, target, gain, shift, converted))
             elif origin[0] == "":
                 into.outside.setdefault(origin[1], ("input", target))
         for connector in _children(system, "Connectors", "Connector"):
             outer = ("", str(connector.get("name")))
             if connector.get("kind") == "output" and outer in incoming:
-                origin = incoming[outer][0]
+                origin = incoming[outer].source
                 while origin[0] not in into.parts and origin in incoming:
-                    origin = incoming[origin][0]
+                    origin = incoming[origin].source
                 if origin[0] in into.parts:
                     into.outside[outer[1]] = ("output", origin)
 
@@ -228,7 +243,7 @@ class _Reader:
         system: ET.Element,
         prefix: str,
         into: _Structure,
-        joints: list[tuple[End, End, float, float]],
+        joints: list[_Link],
     ) -> None:
         elements = system.find(tag(SSD, "Elements"))
         names = {}
@@ -272,7 +287,8 @@ class _Reader:
                         f"'{self.file}': the connection to '{ends[1][1]}' has a {kind}; "
                         "terrafix reads linear ones"
                     )
-            joints.append((ends[0], ends[1], factor, offset))
+            converted = connection.get("suppressUnitConversion") not in ("true", "1")
+            joints.append(_Link(ends[0], ends[1], factor, offset, converted))
 
     def _part(self, name: str, element: ET.Element) -> _Part:
         kind = element.get("type", "application/x-fmu-sharedlibrary")
@@ -283,6 +299,10 @@ class _Reader:
             )
         part = _Part(name, source)
         part.starts = self._values(element, "")
+        for connector in _children(element, "Connectors", "Connector"):
+            unit = next((c.get("unit") for c in connector if c.get("unit")), None)
+            if unit is not None:
+                part.units[str(connector.get("name"))] = self._unit(unit)
         rate = next(element.iter(tag(OWN, "Rate")), None)
         if rate is not None:
             times = rate.get("times")
@@ -296,6 +316,24 @@ class _Reader:
             if hint is not None and hint.get("value"):
                 part.rate = Rate(Fraction(str(hint.get("value"))).limit_denominator(10**9))
         return part
+
+    def _unit(self, name: str, parameters: ET.Element | None = None) -> str:
+        """A unit as the parameter set, or else the package, defines it.
+
+        A base unit without any exponent is what tools write of units that they do not know, since
+        the schema asks for one.
+        """
+        for place, group in ((parameters, SSV), (self.root, SSD)):
+            units = None if place is None else place.find(tag(group, "Units"))
+            for unit in () if units is None else units.findall(tag(SSC, "Unit")):
+                base = unit.find(tag(SSC, "BaseUnit"))
+                if unit.get("name") == name and base is not None and base.attrib:
+                    powers = {symbol: int(base.get(symbol, "0")) for symbol in SI_BASE}
+                    factor, offset = (
+                        float(base.get(*a)) for a in (("factor", "1"), ("offset", "0"))
+                    )
+                    return unit_by_definition(name, factor, powers, offset)
+        return unit_by_name(name)
 
     def _bind_parameters(self, system: ET.Element, prefix: str, into: _Structure) -> None:
         """Parameters of a system are named with the element's name first."""
@@ -326,6 +364,7 @@ class _Reader:
                 if value is None:
                     continue
                 text, unit = value.get("value", ""), value.get("unit")
+                unit = self._unit(unit, parameters) if unit else None
                 found[prefix + str(parameter.get("name"))] = (text, unit)
         return found
 
@@ -350,6 +389,7 @@ class _Reader:
                     f"'{part.name}' has no step size in the package or in its FMU"
                 )
             made.start = _starts(made, part.starts)
+            made.units = _units(made, part.units)
             made.prepare()
         except TerrafixError as error:
             raise type(error)(f"'{self.file}': '{part.name}': {error}") from error
@@ -383,8 +423,8 @@ class _Reader:
             links[key].append(link)
         for (source, target), members in links.items():
             a, b = ".".join(source), ".".join(target)
-            gains = {(m.factor, m.offset) for m in members}
-            if gains == {(1.0, 0.0)}:
+            gains = {(m.factor, m.offset, m.converted) for m in members}
+            if gains == {(1.0, 0.0, True)}:
                 system.connect(a, b)
                 continue
             self._transform(system, fmus, source, target, members)
@@ -404,15 +444,18 @@ class _Reader:
                 f"'{self.file}': the transformation from '{'.'.join(source)}' to "
                 f"'{'.'.join(target)}' is of no plain signal"
             )
-        one = output.single
+        one, other = output.single, input_.single
+        before, after = (f.unit if isinstance(f.unit, str) else "1" for f in (one, other))
+        if all(m.converted for m in members) and _converts(before, after):
+            before = after  # the transformation comes after the conversion
         made = Linear(
             rate=fmus[target[0]].rate,
             factor=",".join(repr(m.factor) for m in members),
             shift=",".join(repr(m.offset) for m in members),
             width=one.size,
             flat=not one.fixed_shape,
-            unit_in=one.unit_text() if isinstance(one.unit, str) else "1",
-            unit_out=input_.single.unit_text() if isinstance(input_.single.unit, str) else "1",
+            unit_in=before,
+            unit_out=after,
         )
         name = f"{source[0]}_{source[1]}_to_{target[0]}_{target[1]}"
         system.add(made, name)
@@ -463,6 +506,26 @@ def _grouped(links: Sequence[_Link], fmus: Mapping[str, Fmu]) -> dict[tuple[End,
     return whole
 
 
+def _converts(source: str, target: str) -> bool:
+    try:
+        return conversion_factor(source, target) is not None
+    except ConfigurationError:
+        return False
+
+
+def _units(fmu: Fmu, connectors: Mapping[str, str]) -> dict[str, str]:
+    """Units that connectors have and the FMU's variables behind them have not."""
+    found: dict[str, str] = {}
+    for name, unit in connectors.items():
+        port = _port_of(fmu, name)
+        if port is not None and not fmu.ports[port].is_bundle and fmu.ports[port].kind == "signal":
+            declared = fmu.ports[port].single.unit
+            undefined = isinstance(declared, str) and declared.endswith(UNDEFINED)
+            if (declared == "1" or undefined) and unit != declared:
+                found[port] = unit
+    return found
+
+
 def _starts(fmu: Fmu, values: Mapping[str, Any]) -> dict[str, Any]:
     """Values of a parameter set by quantity, elements of arrays together; others are left out."""
     known = fmu.settable()
@@ -475,11 +538,15 @@ def _starts(fmu: Fmu, values: Mapping[str, Any]) -> dict[str, Any]:
         if any(g is None for g in given):
             missing = names[[g is None for g in given].index(True)]
             raise ConfigurationError(f"its parameter set has no value for '{missing}'")
-        words = {"true": 1.0, "false": 0.0}
-        numbers = [words.get(g[0]) or float(words.get(g[0], g[0])) for g in given if g is not None]
+        numbers = [
+            _number(g[0], name) for g, name in zip(given, names, strict=True) if g is not None
+        ]
         unit = given[0][1] if given[0] is not None else None
         value: Any = numbers[0] if not quantity.shape else _nested(numbers, quantity.shape)
-        usable = unit and isinstance(quantity.unit, str) and quantity.unit not in ("", "1")
+        own = quantity.unit if isinstance(quantity.unit, str) else "1"
+        usable = bool(unit) and own not in ("", "1")
+        if unit and unit.endswith(UNDEFINED) and unit_label(unit) == unit_label(own):
+            usable = False  # the parameter set leaves it to the FMU what its own label means
         starts[quantity.name] = {"value": value, "unit": unit} if usable else value
     return starts
 
@@ -487,4 +554,16 @@ def _starts(fmu: Fmu, values: Mapping[str, Any]) -> dict[str, Any]:
 def _nested(numbers: list[Any], shape: tuple[int, ...]) -> Any:
     import numpy as np
 
-    return np.reshape(numbers, shape).tolist()
+    return np.reshape(np.array(numbers, dtype=object), shape).tolist()
+
+
+def _number(text: str, name: str) -> float | int:
+    """A number of a parameter set, whole ones to the last digit."""
+    if text in ("true", "false"):
+        return int(text == "true")
+    with suppress(ValueError):
+        return int(text)
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigurationError(f"its parameter set gives '{name}' as '{text}'") from None

@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, WiringError
-from terrafix.cosim.basics.units import base_units, conversion_factor
+from terrafix.cosim.basics.units import (
+    base_offset,
+    base_units,
+    conversion_factor,
+    unit_by_definition,
+)
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Flag, Parameter, Text
 from terrafix.cosim.declare.ports import Input, MessageInput, MessageOutput, Output
@@ -303,3 +308,18 @@ def test_parameters_have_a_value_per_member_while_a_simulation_runs(toys):
     simulation.master.terminate()
     part.mass = 3
     assert float(part.mass) == 3
+
+
+def test_degrees_celsius_by_base_units():
+    """K = 1 degC + 273.15: the factor is of differences."""
+    assert base_units("degC") == (1.0, {"K": 1})
+    assert (base_offset("degC"), base_offset("m/s")) == (273.15, 0.0)
+    assert unit_by_definition("degC", 1.0, {"K": 1}, 273.15) == "degC"
+
+
+def test_a_defined_unit_carries_its_definition():
+    kmph = unit_by_definition("kmph", 0.27778, {"m": 1, "s": -1})
+    assert kmph == "kmph = 0.27778 m/s"
+    assert conversion_factor(kmph, "m/s") == 0.27778
+    assert base_units(kmph) == (0.27778, {"m": 1, "s": -1})
+    assert conversion_factor(kmph, "kg") is None

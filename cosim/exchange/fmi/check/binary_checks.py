@@ -13,8 +13,12 @@ from terrafix.cosim.exchange.fmi.run.archive import Archive
 GLIBC_FLOOR = (2, 28)
 """Newest C library that is assumed of a user's Linux: that of manylinux_2_28."""
 _SYSTEM = re.compile(
-    r"(lib(c|m|dl|rt|pthread|gcc_s|stdc\+\+)\.so|ld-linux|linux-vdso|libSystem|api-ms-win|kernel32"
-    r"|user32|advapi32|msvcrt|ucrtbase|vcruntime|ntdll|bcrypt)",
+    r"^(lib(c|m|dl|rt|pthread|gcc_s|stdc\+\+)\.so|ld-linux|linux-vdso|.*libSystem|.*/usr/lib/"
+    r"|/System/Library/"
+    r"|(api|ext)-ms-win|kernel32|kernelbase|user32|advapi32|gdi32|gdiplus|ole32|oleaut32|shell32"
+    r"|shlwapi|comctl32|comdlg32|ws2_32|wsock32|mswsock|winmm|rpcrt4|dbghelp|psapi|version|iphlpapi"
+    r"|setupapi|crypt32|secur32|userenv|winspool|imm32|netapi32|mpr|uxtheme|powrprof|opengl32"
+    r"|wininet|winhttp|msvcrt|msvcr\d|msvcp\d|concrt|vcomp|ucrtbase|vcruntime|ntdll|bcrypt)",
     re.IGNORECASE,
 )
 _OF_LINKERS = {  # in every shared library, of whatever content
@@ -40,6 +44,10 @@ def exported(binary: Any) -> set[str]:
         return {str(e.name) for e in found.entries} if found is not None else set()
     names = {str(s.name) for s in binary.exported_symbols}
     if isinstance(binary, lief.MachO.Binary):
+        if not names:  # older linkers write no list of exports, only the table of symbols
+            undefined = lief.MachO.Symbol.TYPE.UNDEFINED
+            named = (s for s in binary.symbols if s.is_external and s.type != undefined)
+            names = {str(s.name) for s in named}
         names = {n.removeprefix("_") for n in names}
     return names - _OF_LINKERS
 
@@ -52,7 +60,8 @@ def required(binary: Any) -> set[str]:
         return {str(name) for name in binary.libraries}
     if isinstance(binary, lief.PE.Binary):
         return {str(i.name) for i in binary.imports}
-    return {str(x.name) for x in binary.libraries if "/" in str(x.name)}
+    own = lief.MachO.LoadCommand.TYPE.ID_DYLIB  # the name that the library has itself
+    return {str(x.name) for x in binary.libraries if "/" in str(x.name) and x.command != own}
 
 
 def glibc(binary: Any) -> tuple[int, int] | None:
@@ -75,7 +84,12 @@ def check_binaries(archive: Archive) -> Iterator[Finding]:
     root = archive.folder / "binaries"
     platforms = sorted(p for p in root.iterdir() if p.is_dir()) if root.is_dir() else []
     if not platforms:
-        yield Finding("library", ERROR, "binaries", "there is no binary", "nothing can run it")
+        sources = (archive.folder / "sources").is_dir()
+        yield Finding(
+            "library", WARNING if sources else ERROR, "binaries",
+            "there is no binary, only sources" if sources else "there is no binary",
+            "an importer must compile it" if sources else "nothing can run it",
+        )  # fmt: skip
         return
     for platform in platforms:
         for file in sorted(platform.iterdir()):

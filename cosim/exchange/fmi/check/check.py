@@ -13,10 +13,10 @@ from typing import Any
 
 from terrafix.cosim.basics.errors import TerrafixError
 from terrafix.cosim.exchange.fmi.check.binary_checks import check_binaries
-from terrafix.cosim.exchange.fmi.check.findings import ERROR, NOTE, Finding
+from terrafix.cosim.exchange.fmi.check.findings import ERROR, NOTE, WARNING, Finding
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
-from terrafix.cosim.exchange.fmi.run.remote import ProcessError, Worker
+from terrafix.cosim.exchange.fmi.run.remote import FIRST_LIMIT, ProcessError, Worker
 
 CALLING = (
     "start",
@@ -32,6 +32,9 @@ CALLING = (
 """Checks that call the binary, as `terrafix.cosim.exchange.fmi.check.checks` has them."""
 LIMIT = 120.0
 """Longest time of one check [s]."""
+WRONG_STEPS = ("negative", "NaN", "fraction")
+"""Steps that no master may ask for; an FMU need not answer."""
+WRONG_STEP_LIMIT = 5.0
 
 
 @dataclass
@@ -47,8 +50,9 @@ class Report:
     checks : list of str
         What was checked.
     findings : list of Finding
-        Errors and warnings.
+        Breaches of the standard.
     notes : list of Finding
+        Warnings and notes.
     """
 
     path: Path
@@ -64,9 +68,14 @@ class Report:
         """Whether there is no finding."""
         return not self.findings
 
+    @property
+    def warnings(self) -> list[Finding]:
+        """Notes of what is allowed and may hurt."""
+        return [found for found in self.notes if found.severity == WARNING]
+
     def add(self, found: Finding) -> None:
         """File a finding, or a note."""
-        into = self.notes if found.severity == NOTE else self.findings
+        into = self.findings if found.severity == ERROR else self.notes
         if found not in into:
             into.append(found)
 
@@ -116,6 +125,14 @@ def check_fmu(
     report.checks.append("library")
     for found in check_binaries(archive):
         report.add(found)
+    if getattr(description, "scheduledExecution", None) is not None:
+        report.kinds += ("scheduled execution",)
+        report.add(
+            Finding(
+                "run", NOTE, "scheduled execution", "it is not checked: only what the FMU offers "
+                "besides, its description and its binaries are",
+            )
+        )  # fmt: skip
     calls = [(kind, name) for kind in kinds for name in CALLING]
     worker: Worker | None = None
     try:
@@ -124,24 +141,65 @@ def check_fmu(
                 progress(f"{name}, {kind}", number / len(calls))
             if name not in report.checks:
                 report.checks.append(name)
-            worker = worker or Worker("terrafix.cosim.exchange.fmi.check.checks", "the FMU")
             try:
-                for found in worker.call("check", str(path), kind, name, limit=limit):
-                    report.add(found)
+                worker = worker or _fresh(path, kind)
+                once = bool(offered[kind].canBeInstantiatedOnlyOncePerProcess)
+                if name == "step size":
+                    worker = _wrong_steps(worker, report, kind, once=once)
+                else:
+                    for found in worker.call("check", str(path), kind, name, limit=limit):
+                        report.add(found)
+                if once and worker is not None:
+                    worker.close()
+                    worker = None
             except ProcessError as error:
-                worker.close(kill=True)
+                if worker is not None:
+                    worker.close(kill=True)
                 worker = None
                 report.add(Finding(name, ERROR, kind, str(error), "so does its importer's process"))
             except TerrafixError as error:
                 report.add(Finding(name, ERROR, kind, str(error), "no importer gets further"))
                 break
-            if worker is not None and offered[kind].canBeInstantiatedOnlyOncePerProcess:
-                worker.close()
-                worker = None
     finally:
         if worker is not None:
             worker.close()
     return report
+
+
+def _fresh(path: str | Path, kind: str) -> Worker:
+    """A process with the FMU loaded; the time that takes is none of a check's."""
+    worker = Worker("terrafix.cosim.exchange.fmi.check.checks", "the FMU")
+    try:
+        worker.call("load", str(path), kind, limit=FIRST_LIMIT)
+    except BaseException:
+        worker.close(kill=True)
+        raise
+    return worker
+
+
+def _wrong_steps(worker: Worker, report: Report, kind: str, *, once: bool) -> Worker | None:
+    """Ask for steps that no master may ask for, each within a few seconds; `once`: a process."""
+    now: Worker | None = worker
+    for case in WRONG_STEPS if kind == CO_SIMULATION else ():
+        now = now or _fresh(report.path, kind)
+        name = f"step size, {case}"
+        try:
+            for found in now.call("check", str(report.path), kind, name, limit=WRONG_STEP_LIMIT):
+                report.add(found)
+        except ProcessError as error:
+            now.close(kill=True)
+            now = None
+            what = {"negative": "a negative step", "NaN": "a step of NaN"}.get(case, "a fraction")
+            report.add(
+                Finding(
+                    "step size", WARNING, "doStep", f"asked for {what}, {error}",
+                    "one wrong step costs the whole process",
+                )
+            )  # fmt: skip
+        if once and now is not None:
+            now.close()
+            now = None
+    return now
 
 
 def _validated(path: str | Path) -> list[str]:

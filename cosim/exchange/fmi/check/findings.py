@@ -17,8 +17,8 @@ class Finding:
     check : str
         Which check found it.
     severity : {"error", "warning", "note"}
-        Notes are no findings: they say what was not checked, or what cannot be wrong but may
-        surprise.
+        An error is a breach of the standard, and alone a finding. A warning is allowed and may
+        hurt; a note says what was not checked, or what may surprise.
     where : str
         Variable, function or file.
     what : str

@@ -34,6 +34,7 @@ from terrafix.cosim.exchange.fmi.run.remote import (
     send,
     serve,
 )
+from terrafix.cosim.exchange.fmi.run.whole import INTEGER
 
 STEPS = 10
 """Steps of the self-test."""
@@ -136,6 +137,7 @@ class FleetApart:
         self.inputs = np.zeros((n_members, sum(g.size for g in setup.inputs)))
         self.outputs = np.zeros((n_members, sum(g.size for g in setup.outputs)))
         self._limit = limit
+        self._log: list[tuple[int, int, str]] = []
         self._forks: dict[int, _Fork] = {}
         _prepare(setup)
 
@@ -162,13 +164,19 @@ class FleetApart:
         for row, fork in self._forks.items():
             fork.ask(name, self.inputs[row : row + 1], *arguments(row))
         failures: Failures = {}
-        for row, (own, outputs) in self._answers(failures).items():
+        for row, (own, outputs, log) in self._answers(failures).items():
             self.outputs[row] = outputs[0]
+            self._log += [(row, status, text) for _, status, text in log]
             if own:
                 failures[row] = own[0]
         for row in failures:
             self._end(row)
         return failures
+
+    def take_log(self) -> Sequence[tuple[int, int, str]]:
+        """As `Fleet.take_log`."""
+        found, self._log = self._log, []
+        return found
 
     def _answers(self, failures: Failures | None = None) -> dict[int, Any]:
         """What each fork answers; the deaths of forks are failures."""
@@ -293,22 +301,42 @@ def rehearse(setup: Setup, inputs: FloatArray, h: float, limit: float) -> Distur
         first, again, second, both, after = _played(parts, limit)
         if isinstance(first, str) or isinstance(second, str) or isinstance(again, str):
             continue  # it does not take these inputs
-        if not np.array_equal(first[-1], again[-1], equal_nan=True):
+        kinds = _kinds(setup)
+        if not _same(kinds, first[-1], again[-1]).all():
             return None
         expected = np.concatenate([first[-1], second[-1]], axis=1), first[-1]
         for alone, beside in zip(expected, (both, after), strict=True):
             if isinstance(beside, str):
                 return Disturbance(-1, said=beside)
-            if not np.array_equal(alone, beside[-1], equal_nan=True):
-                return _difference(alone, beside[-1])
+            same = _same(kinds, alone, beside[-1])
+            if not same.all():
+                return _difference(kinds, alone, beside[-1], same)
         return None
     return None
 
 
-def _difference(alone: FloatArray, beside: FloatArray) -> Disturbance:
-    same = (alone == beside) | (np.isnan(alone) & np.isnan(beside))
+def _kinds(setup: Setup) -> list[str]:
+    """Type of each column of the outputs."""
+    return [group.kind for group in setup.outputs for _ in range(group.size)]
+
+
+def _same(kinds: Sequence[str], alone: FloatArray, beside: FloatArray) -> NDArray[np.bool_]:
+    """Where two are equal, (..., width); of whole numbers, all 64 bits."""
+    whole = np.array([kind in INTEGER for kind in kinds], np.bool_)
+    bits = alone.view(np.int64) == beside.view(np.int64)
+    real = (alone == beside) | (np.isnan(alone) & np.isnan(beside))
+    found: NDArray[np.bool_] = np.where(whole, bits, real)
+    return found
+
+
+def _difference(
+    kinds: Sequence[str], alone: FloatArray, beside: FloatArray, same: NDArray[np.bool_]
+) -> Disturbance:
     at = tuple(np.argwhere(~same)[-1])
-    return Disturbance(int(at[-1]), float(alone[at]), float(beside[at]))
+    column = int(at[-1])
+    whole = kinds[column] in INTEGER
+    values = [(rows.view(np.int64) if whole else rows)[at].item() for rows in (alone, beside)]
+    return Disturbance(column, *values)
 
 
 def _play(
@@ -382,7 +410,7 @@ def _fleet_functions(fleet: Any) -> dict[str, Any]:
         def call(inputs: NDArray[np.float64], *arguments: Any) -> Any:
             fleet.inputs[...] = inputs
             failures = getattr(fleet, name)(*arguments)
-            return failures, fleet.outputs
+            return failures, fleet.outputs, fleet.take_log()
 
         return call
 

@@ -7,6 +7,7 @@ the loader after a thousand. Status and messages of an instance become `FmuError
 from __future__ import annotations
 
 import ctypes as ct
+import math
 import os
 import sys
 import tempfile
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
 from terrafix.cosim.exchange.fmi.run.archive import Archive
+from terrafix.cosim.exchange.fmi.run.whole import limits
 
 CO_SIMULATION, MODEL_EXCHANGE = "co-simulation", "model exchange"
 STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
@@ -42,6 +44,8 @@ _TYPES: dict[str, tuple[str, Any]] = {  # of the variable: (in function names, o
     "UInt64": ("UInt64", ct.c_uint64),
     "Boolean": ("Boolean", ct.c_bool),
 }
+
+_MOST_SINGLE = float(np.finfo(np.float32).max)
 
 
 class FmuError(TerrafixError):
@@ -117,24 +121,28 @@ class _EventInfo2(ct.Structure):
 
 
 _messages: dict[int, list[str]] = {}
+HEARD: list[tuple[int, int, str]] = []
+"""What instances logged: of which environment, with which status, what; until a fleet takes it."""
+_MOST_HEARD = 1000
 
 
-def _note(environment: int | None, category: bytes | None, text: bytes | None) -> None:
+def _note(environment: int | None, status: int, text: bytes | None) -> None:
     said = (text or b"").decode(errors="replace").strip()
     found = _messages.setdefault(environment or 0, [])
     if said and len(found) < 100:
         found.append(said)
-    del category
+    if said and len(HEARD) < _MOST_HEARD:
+        HEARD.append((environment or 0, int(status), said))
 
 
 def _log_of_fmi2(environment: Any, name: Any, status: Any, category: Any, text: Any) -> None:
-    del name, status
-    _note(environment, category, text)
+    del name, category
+    _note(environment, status, text)
 
 
 def _log_of_fmi3(environment: Any, status: Any, category: Any, text: Any) -> None:
-    del status
-    _note(environment, category, text)
+    del category
+    _note(environment, status, text)
 
 
 _log2 = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_char_p, ct.c_int, ct.c_char_p, ct.c_char_p)(
@@ -250,7 +258,7 @@ class Instance:
     def __init__(self, library: Library, name: str) -> None:
         self.library = library
         self._version = library.version
-        self._environment = Instance._next
+        self._environment = self.environment = Instance._next
         Instance._next += 1
         _messages[self._environment] = []
         self.pointer: ct.c_void_p | None = None
@@ -308,15 +316,16 @@ class Instance:
 
     # ------------------------------------------------------------------ life cycle
 
-    def begin(self, t: float) -> None:
-        """Enter initialization mode at a time [s]."""
+    def begin(self, t: float, tolerance: float | None = None) -> None:
+        """Enter initialization mode at a time [s]; with the tolerance of its own solver, if any."""
         none, time = ct.c_double(0.0), ct.c_double(t)
+        given = ct.c_double(tolerance or 0.0)
         if self._version == 2:
-            self.call("SetupExperiment", 0, none, time, 0, none)
+            self.call("SetupExperiment", int(bool(tolerance)), given, time, 0, none)
             self.call("EnterInitializationMode")
         else:
-            no = ct.c_bool(False)
-            self.call("EnterInitializationMode", no, none, time, no, none)
+            has, no = ct.c_bool(bool(tolerance)), ct.c_bool(False)
+            self.call("EnterInitializationMode", has, given, time, no, none)
 
     def finish(self) -> None:
         """Leave initialization mode."""
@@ -359,11 +368,49 @@ class Instance:
         """Set variables of one type."""
         name, ctype = self._type(kind)
         flat = np.asarray(values).ravel().tolist()
-        convert: Any = float if ctype in (ct.c_double, ct.c_float) else int
-        converted = [convert(value) for value in flat]
+        if ctype is ct.c_double:
+            converted = flat
+        elif ctype is ct.c_float:
+            converted = self._singles(kind, vr, flat)
+        else:
+            converted = self._wholes(kind, vr, flat)
         array = (ctype * max(len(flat), 1))(*converted)
         sizes = () if self._version == 2 else (ct.c_size_t(len(flat)),)
         self.call(f"Set{name}", vr, ct.c_size_t(len(vr)), array, *sizes)
+
+    def _wholes(self, kind: str, vr: Any, values: list[Any]) -> list[int]:
+        low, high = limits(kind, self._version)
+        for k, value in enumerate(values):
+            if not low <= value <= high or value != int(value):
+                raise FmuError(
+                    f"'{self._name_of(kind, vr, k)}' ({kind}) is set to {value!r}; it takes "
+                    f"whole numbers from {low} to {high}"
+                )
+        return [int(value) for value in values]
+
+    def _singles(self, kind: str, vr: Any, values: list[Any]) -> list[float]:
+        for k, value in enumerate(values):
+            if math.isfinite(value) and abs(value) > _MOST_SINGLE:
+                raise FmuError(
+                    f"'{self._name_of(kind, vr, k)}' ({kind}) is set to {value!r}; it takes "
+                    f"numbers up to {_MOST_SINGLE:.7g}"
+                )
+        return values
+
+    def _name_of(self, kind: str, vr: Any, place: int) -> str:
+        """Name of the variable that a value among those of several references belongs to."""
+        of_kind = {
+            int(v.valueReference): v
+            for v in reversed(self.library.archive.description.modelVariables)
+            if v.type == kind
+        }
+        for reference in vr:
+            variable = of_kind.get(int(reference))
+            size = math.prod(int(n) for n in getattr(variable, "shape", None) or ())
+            if place < size:
+                return variable.name if variable is not None else f"value reference {reference}"
+            place -= size
+        return "a variable"
 
     # ------------------------------------------------------------------ co-simulation
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -10,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
+from terrafix.cosim.basics.units import UNDEFINED
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, FilePath, Flag, Parameter, Table
 from terrafix.cosim.declare.ports import (
@@ -26,19 +28,25 @@ from terrafix.cosim.declare.ports import (
     Port,
 )
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
-from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
+from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE, STATUS
 from terrafix.cosim.exchange.fmi.run.fleet import Failures, Group, Message, Setup
 from terrafix.cosim.exchange.fmi.run.places import AnyFleet, make_fleet
 from terrafix.cosim.exchange.fmi.run.reading import (
     ImportedPort,
     Interface,
     Quantity,
+    observed,
     read_interface,
 )
 from terrafix.cosim.exchange.fmi.run.solvers import SOLVERS
+from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, MOST, cells, read_whole
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.memory.messages import MessageReader
 from terrafix.cosim.memory.slots import BundleView
+
+_log = logging.getLogger(__name__)
+MOST_LOGGED = 20
+"""Messages of one FMU that are shown."""
 
 
 class Fmu(Component):
@@ -63,8 +71,14 @@ class Fmu(Component):
     start = Table(doc="parameters and start values of inputs by name, with units")
     units = Table(doc="units of ports by name, where the FMU does not say")
     frames = Table(doc="frames of ports by name, where the FMU does not say")
+    observe = Table(doc='local variables and parameters that outputs show: { height = "body.h" }')
     solver = Choice(SOLVERS, "cvode", doc="integrator of model exchange")
-    tolerance = Parameter(1e-10, positive=True, doc="relative, of that integrator")
+    tolerance = Parameter(
+        0.0,
+        minimum=0.0,
+        doc="relative, of that integrator (0: 1e-10), or handed on to the FMU's own in "
+        "co-simulation (0: what its default experiment says)",
+    )
     isolate = Flag(False, doc="run it in a process of its own: slower, but its crash is survived")
     time_limit = Parameter(
         60.0, unit="s", positive=True, doc="longest answer of an isolated FMU, in real time"
@@ -95,6 +109,7 @@ class Fmu(Component):
                 else archive.description.modelExchange
             ).modelIdentifier
         )
+        self._observe()
         self._given = self._read_starts()
         self.ports = {port.name: self._port(port) for port in found.ports}
         for table in ("units", "frames"):
@@ -112,6 +127,32 @@ class Fmu(Component):
         if found.left_out:
             notes += (f"{', '.join(found.left_out)} cannot be connected: no numbers",)
         self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
+
+    def _observe(self) -> None:
+        """Add an output for each variable that `observe` names."""
+        interface = self.interface
+        taken = {port.name for port in interface.ports}
+        for name, variable in self.given_parameters["observe"].items():
+            where = f"'{self.name}.observe.{name}'"
+            if not re.fullmatch(r"[A-Za-z]\w*", name) or name in taken:
+                why = "is a port of the FMU" if name in taken else "is no name of a port"
+                raise ConfigurationError(f"{where}: '{name}' {why}\n  choose another name")
+            quantity = observed(
+                interface.archive,
+                str(variable),
+                arrays=self.given_parameters["arrays"],
+                where=where,
+            )
+            port = ImportedPort(name, "signal", False, None, {"": (quantity, None)})
+            interface.ports.append(port)
+
+    def tolerance_of_solver(self) -> float | None:
+        """What is set, or in co-simulation what the FMU's default experiment says."""
+        if given := float(self.given_parameters["tolerance"]):
+            return given
+        experiment = self.interface.archive.description.defaultExperiment
+        own = None if experiment is None else experiment.tolerance
+        return float(own) if own and self.interface.kind == CO_SIMULATION else None
 
     def _default_period(self) -> Fraction | None:
         experiment = self.interface.archive.description.defaultExperiment
@@ -146,7 +187,8 @@ class Fmu(Component):
 
     def _field(self, port: str, quantity: Quantity, frame: str | None) -> Field:
         unit, wanted = quantity.unit, self.given_parameters["units"].get(port)
-        if wanted is not None and unit not in ("1", wanted):
+        known = isinstance(unit, str) and not unit.endswith(UNDEFINED) and unit != "1"
+        if wanted is not None and (known or not isinstance(unit, str)) and unit != wanted:
             raise ConfigurationError(
                 f"'{self.name}.units' says {wanted} for '{port}', the FMU says {unit}\n"
                 "  leave it out: units are converted where ports are connected"
@@ -160,16 +202,23 @@ class Fmu(Component):
             )
         return quantity.field(frame or other)
 
-    def _start_value(self, quantity: Quantity) -> FloatArray:
-        given = self._given.get(quantity.name)
+    def _start_value(self, quantity: Quantity) -> NDArray[Any]:
+        given: Any = self._given.get(quantity.name)
         start = given if given is not None else quantity.start
-        value = np.zeros(quantity.shape) if start is None else np.asarray(start, dtype=np.float64)
-        return value.reshape(quantity.shape)
+        dtype = np.int64 if quantity.kind in INTEGER else np.float64
+        if start is None:
+            return np.zeros(quantity.shape, dtype)
+        if quantity.kind == "UInt64" and (most := max(np.array(start, object).ravel())) > MOST:
+            raise ConfigurationError(
+                f"'{self.name}': '{quantity.name}' (UInt64) starts at {most}; a port holds at most "
+                f"{MOST}"
+            )
+        return np.asarray(start, dtype=dtype).reshape(quantity.shape)
 
-    def _read_starts(self) -> dict[str, FloatArray]:
+    def _read_starts(self) -> dict[str, NDArray[Any]]:
         """Values of ``start``, converted to the units of the variables."""
         known = self.settable()
-        values = {}
+        values: dict[str, NDArray[Any]] = {}
         for name, value in self.given_parameters["start"].items():
             if name not in known:
                 raise ConfigurationError(
@@ -177,6 +226,15 @@ class Fmu(Component):
                     f"  {nearest(name, known, what='it has')}"
                 )
             quantity = known[name]
+            if quantity.kind in (*INTEGER, *BOOLEAN):
+                values[name] = read_whole(
+                    value,
+                    quantity.kind,
+                    self.interface.archive.version,
+                    quantity.shape,
+                    where=f"'{self.name}.start.{name}'",
+                )
+                continue
             # nobody says what a foreign array's elements have in common
             reader = Parameter(
                 shape=quantity.shape, unit=quantity.unit, frame="of the FMU", infinite=True
@@ -190,7 +248,7 @@ class Fmu(Component):
         inputs = {q.name: q for p in ports if p.is_input for q, _ in p.fields.values()}
         return self.interface.parameters | inputs
 
-    def given_starts(self) -> dict[str, FloatArray]:
+    def given_starts(self) -> dict[str, NDArray[Any]]:
         """Values of ``start`` in the units of the variables."""
         return dict(self._given)
 
@@ -245,11 +303,13 @@ class Fmu(Component):
             self._start_settings(),
             self._identities(),
             self.given_parameters["solver"],
-            float(self.given_parameters["tolerance"]),
+            self.tolerance_of_solver(),
         )
         starts = np.zeros((env.n_members, sum(g.size for g in inputs)))
+        self._kinds = {(port, name): q.kind for port, name, q in (*read, *written)}
         for port, name, quantity in read:
-            starts[:, self._input_at[port, name]] = self._start_value(quantity).ravel()
+            columns = cells(starts, quantity.kind, self._input_at[port, name])
+            columns[...] = self._start_value(quantity).ravel()
         self._fleet, remark = make_fleet(
             interface,
             setup,
@@ -260,12 +320,14 @@ class Fmu(Component):
         )
         self.remarks = [remark] if remark else []
         self._sequence = {p.name: np.zeros(env.n_members, np.int64) for p in self._outputs}
-        self._t, self._first = 0.0, True
+        self._t, self._first, self._logged = 0.0, True, 0
         self._skipped = ~env.active
         self._fleet.inputs[...] = starts
         self._take_inputs(finite=True)
         self._bind_copies()
-        self._report(self._fleet.start(env.active.copy(), self._fresh_messages()))
+        failures = self._fleet.start(env.active.copy(), self._fresh_messages())
+        self._show_log(self._fleet.take_log(), failures)
+        self._report(failures)
         for target, source in self._results:
             target[...] = source
         self._publish_messages()
@@ -276,7 +338,7 @@ class Fmu(Component):
             (
                 parameters[name].kind,
                 tuple(parameters[name].references),
-                tuple(float(v) for v in value.ravel()),
+                tuple(value.ravel().tolist()),
             )
             for name, value in self._given.items()
             if name in parameters
@@ -292,7 +354,7 @@ class Fmu(Component):
         for name, numbers in values.items():
             quantity = self.interface.parameters.get(name)
             if quantity is not None and name not in self._given:
-                each = tuple(float(v) for v in numbers)
+                each = tuple(np.asarray(numbers).tolist())
                 found.append((quantity.kind, tuple(quantity.references), each))
         return tuple(found)
 
@@ -306,30 +368,39 @@ class Fmu(Component):
 
     def _take_inputs(self, *, finite: bool = False, late: bool = True) -> None:
         """Copy inputs into the rows; only those that are known, and not those read at the start."""
-        fleet = self._fleet
-        assert fleet is not None
-        for (port, name), columns in self._input_at.items():
+        for port, name in self._input_at:
             if not late and self.ports[port].at == "start":
                 continue
             rows = self._view(port, name).reshape(self.n_members, -1)
+            target = self._input_cells(port, name)
             if finite:
                 known = np.isfinite(rows.astype(np.float64)).all(axis=1)
-                fleet.inputs[known, columns] = rows[known]
+                target[known] = rows[known]
             else:
-                fleet.inputs[:, columns] = rows
+                target[...] = rows
+
+    def _input_cells(self, port: str, name: str) -> NDArray[Any]:
+        """What the FMU will read, (n_members, size), in the type of the port."""
+        assert self._fleet is not None
+        key = port, name
+        return cells(self._fleet.inputs, self._kinds[key], self._input_at[key])
+
+    def _output_cells(self, port: str, name: str) -> NDArray[Any]:
+        """What the FMU has written."""
+        assert self._fleet is not None
+        key = port, name
+        return cells(self._fleet.outputs, self._kinds[key], self._output_at[key])
 
     def _bind_copies(self) -> None:
         """Pairs (target, source) of what is copied before and after each step."""
-        fleet = self._fleet
-        assert fleet is not None
         n = self.n_members
         self._copies = [
-            (fleet.inputs[:, columns], self._view(port, name).reshape(n, -1))
-            for (port, name), columns in self._input_at.items()
+            (self._input_cells(port, name), self._view(port, name).reshape(n, -1))
+            for port, name in self._input_at
         ]
         self._results = [
-            (self._view(port, name).reshape(n, -1), fleet.outputs[:, columns])
-            for (port, name), columns in self._output_at.items()
+            (self._view(port, name).reshape(n, -1), self._output_cells(port, name))
+            for port, name in self._output_at
             if self.ports[port].kind == "signal"
         ]
 
@@ -350,13 +421,34 @@ class Fmu(Component):
                 skipped = np.flatnonzero(gone).tolist()
                 self._skipped |= gone
         messages = self._fresh_messages() if self._messages else ()
-        failures = fleet.step(self._t, dt, messages, skipped)
+        # not dt: the FMU must find the end of its step at t_now + h, to the last bit
+        failures = fleet.step(self._t, t - self._t, messages, skipped)
         self._t = t
+        if said := fleet.take_log():
+            self._show_log(said, failures)
         if failures:
             self._report(failures)
         for target, source in self._results:
             target[...] = source
         self._publish_messages()
+
+    def _show_log(self, said: Sequence[tuple[int, int, str]], failures: Failures) -> None:
+        """Show what the FMU logged, with the member; not what a failure quotes."""
+        for row, status, text in said:
+            if text in failures.get(row, ""):
+                continue
+            level = logging.WARNING if status > 0 else logging.INFO
+            self._logged += level == logging.WARNING
+            if level == logging.WARNING and self._logged > MOST_LOGGED:
+                continue
+            what = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
+            member = self.environment.members[row]
+            path = self.environment.path
+            _log.log(
+                level, "'%s', member %d, t = %.9g s: %s: %s", path, member, self._t, what, text
+            )
+            if level == logging.WARNING and self._logged == MOST_LOGGED:
+                _log.warning("'%s': further messages of this FMU are not shown", path)
 
     def _report(self, failures: Failures) -> None:
         for row, text in failures.items():
@@ -379,24 +471,22 @@ class Fmu(Component):
             assert port.sequence is not None
             values += [(port.t, view.t), (port.sequence, view.sequence)]
             for quantity, array in values:
-                chosen = np.asarray(array[rows], dtype=np.float64).reshape(len(rows), -1)
+                chosen = np.asarray(array[rows]).reshape(len(rows), -1)
                 sent.append(Message(quantity.kind, tuple(quantity.references), rows, chosen))
         return sent
 
     def _publish_messages(self) -> None:
         """Publish messages where their number has changed."""
-        fleet = self._fleet
-        assert fleet is not None
         for port in self._published:
-            number = fleet.outputs[:, self._output_at[port.name, "sequence"]][:, 0].astype(np.int64)
+            number = self._output_cells(port.name, "sequence")[:, 0].astype(np.int64)
             new = number > self._sequence[port.name]
             if not new.any():
                 continue
             self._sequence[port.name] = number
-            t = fleet.outputs[:, self._output_at[port.name, "t"]][:, 0]
+            t = self._output_cells(port.name, "t")[:, 0]
             writer = self.port_views[port.name]
             for name, (quantity, _) in port.fields.items():
-                rows = fleet.outputs[:, self._output_at[port.name, name]]
+                rows = self._output_cells(port.name, name)
                 writer.draft[name][...] = rows.reshape(self.n_members, *quantity.shape)
             writer.publish_draft(t, new)
 

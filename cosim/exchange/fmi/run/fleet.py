@@ -1,6 +1,7 @@
 """Instances of one FMU, one for each member: started, stepped, saved and freed together.
 
-Values go in and out as rows of numbers, (n_members, width), all quantities side by side. A member
+Values go in and out as rows of numbers, (n_members, width), all quantities side by side; of whole
+numbers a row holds the 64 bits themselves (`cells`), so that none loses its last digit. A member
 whose instance fails is reported with what the FMU said; the others go on. `Fleet` runs here,
 `terrafix.cosim.exchange.fmi.run.remote.RemoteFleet` is the same in a process of its own.
 """
@@ -21,6 +22,7 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import (
     CO_SIMULATION,
+    HEARD,
     FmuError,
     Instance,
     Kept,
@@ -28,10 +30,12 @@ from terrafix.cosim.exchange.fmi.run.binding import (
     references,
 )
 from terrafix.cosim.exchange.fmi.run.solvers import Integrator
+from terrafix.cosim.exchange.fmi.run.whole import INTEGER, MOST, cells
 from terrafix.cosim.kernels import toolchain
 
 Failures = dict[int, str]
 """Row of a member to what went wrong."""
+MODEL_EXCHANGE_TOLERANCE = 1e-10
 _DOUBLE = ("Real", "Float64")
 _STEP, _NOT_FINITE = 2, 4  # of `enum failure` in driver.c
 _REASONS = {
@@ -68,7 +72,8 @@ class Setup:
     starts : tuple of (str, tuple of int, tuple of float)
         Type, value references and values set before initialization.
     solver : str
-    tolerance : float
+    tolerance : float or None
+        Of the integrator in model exchange; in co-simulation handed on to the FMU, if there is one.
     """
 
     file: str
@@ -79,7 +84,7 @@ class Setup:
     starts: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
     each: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
     solver: str = "cvode"
-    tolerance: float = 1e-10
+    tolerance: float | None = None
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,7 @@ class Message:
     kind: str
     references: tuple[int, ...]
     rows: NDArray[np.int64]
-    values: FloatArray
+    values: NDArray[Any]
 
     def send(self, row: int, instance: Instance) -> None:
         """Set them on one member's instance, if they are meant for it."""
@@ -233,28 +238,37 @@ class Fleet:
             instance.set(kind, references(vr), values)
         for kind, vr, values in self.setup.each:
             instance.set(kind, references(vr), values[row])
-        instance.begin(0.0)
+        tolerance = self.setup.tolerance
+        instance.begin(0.0, tolerance if self.setup.kind == CO_SIMULATION else None)
         self._set_all(instance, row)
         for message in messages:
             message.send(row, instance)
         instance.finish()
         if self.setup.kind != CO_SIMULATION:
             self._integrators[row] = Integrator(
-                instance, self.archive, 0.0, self.setup.solver, self.setup.tolerance
+                instance,
+                self.archive,
+                0.0,
+                self.setup.solver,
+                tolerance or MODEL_EXCHANGE_TOLERANCE,
             )
         self._get_all(instance, row)
 
     def _set_all(self, instance: Instance, row: int) -> None:
         for group in self.setup.inputs:
-            values = self.inputs[row, group.start : group.start + group.size]
+            columns = slice(group.start, group.start + group.size)
+            values = cells(self.inputs, group.kind, columns)[row]
             instance.set(group.kind, self._references[group], values)
 
     def _get_all(self, instance: Instance, row: int) -> None:
         for group in self.setup.outputs:
             values = instance.get(group.kind, self._references[group], group.size)
-            self.outputs[row, group.start : group.start + group.size] = values
-        if not np.isfinite(self.outputs[row]).all():
-            raise FmuError("an output is not finite")
+            if group.kind == "UInt64" and len(values) and int(values.max()) > MOST:
+                raise FmuError(f"an output (UInt64) is {values.max()}; a port holds at most {MOST}")
+            if group.kind not in INTEGER and not np.isfinite(values).all():
+                raise FmuError("an output is not finite")
+            columns = slice(group.start, group.start + group.size)
+            cells(self.outputs, group.kind, columns)[row] = values
 
     # ------------------------------------------------------------------ stepping
 
@@ -368,6 +382,15 @@ class Fleet:
                 f"fmi{self.library.version}{_REASONS[code]}{instance.said()}"
             )  # fmt: skip
             found[row] = what
+        return found
+
+    def take_log(self) -> Sequence[tuple[int, int, str]]:
+        """What the FMU logged since this was last asked: row, status as FMI numbers it, text."""
+        if not HEARD:
+            return ()
+        rows = {i.environment: row for row, i in enumerate(self.instances) if i is not None}
+        found = [(rows[e], status, text) for e, status, text in HEARD if e in rows]
+        HEARD[:] = [each for each in HEARD if each[0] not in rows]
         return found
 
     # ------------------------------------------------------------------ state

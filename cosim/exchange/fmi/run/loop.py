@@ -122,7 +122,14 @@ class FmuLoop(Component):
             outputs, output_at = grouped(written)
             self._at |= {(name, port): at for (port, _), at in (input_at | output_at).items()}
             file = str(part.interface.archive.path.absolute())
-            setup = Setup(file, CO_SIMULATION, f"{env.path}.{name}", inputs, outputs)
+            setup = Setup(
+                file,
+                CO_SIMULATION,
+                f"{env.path}.{name}",
+                inputs,
+                outputs,
+                tolerance=part.tolerance_of_solver(),
+            )
             starts = np.zeros((env.n_members, sum(g.size for g in inputs)))
             for port in part.inputs():
                 starts[:, self._at[name, port]] = np.asarray(part.ports[port].default).ravel()
@@ -168,7 +175,7 @@ class FmuLoop(Component):
         tolerance = self.parameter_values["tolerance"]
         for _ in range(self.given_parameters["most_iterations"]):
             for name, fleet in self._fleets.items():
-                self._report(name, fleet.step(self._t, dt, (), self._gone()))
+                self._report(name, fleet.step(self._t, t - self._t, (), self._gone()))
             change = self._inside()
             wanting = (change > tolerance) & self.environment.active
             if not wanting.any():

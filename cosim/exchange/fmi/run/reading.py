@@ -15,18 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.basics.units import check_unit
+from terrafix.cosim.basics.errors import ConfigurationError, nearest
+from terrafix.cosim.basics.units import SI_BASE, check_unit, unit_by_definition, unit_by_name
 from terrafix.cosim.exchange.fmi.run.archive import Archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
+from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, whole_start
 from terrafix.cosim.memory.fields import Field, Unit
 
 REAL = ("Real", "Float64", "Float32")
-BOOLEAN = ("Boolean",)
-INTEGER = (
-    *("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16"),
-    *("Int32", "UInt32", "Int64", "UInt64"),
-)
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\d+)*)\]\Z")
 
 
@@ -44,7 +40,7 @@ class Quantity:
         Value references: one of an FMI 3 array, one for each scalar.
     shape : tuple of int
     unit : str or tuple of str
-    start : list of float or None
+    start : list of float or int, or None
     causality, variability : str
     doc : str
     base : int
@@ -56,7 +52,7 @@ class Quantity:
     references: list[int]
     shape: tuple[int, ...]
     unit: Unit = "1"
-    start: list[float] | None = None
+    start: list[float] | list[int] | None = None
     causality: str = "local"
     variability: str = "continuous"
     doc: str = ""
@@ -188,13 +184,45 @@ def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True)
 # --------------------------------------------------------------------------------- variables
 
 
-def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list[str]]:
+CONNECTED = ("input", "output")
+PARAMETERS = ("parameter", "structuralParameter")
+
+
+def observed(archive: Archive, name: str, *, arrays: bool, where: str) -> Quantity:
+    """A local variable or parameter by its name, whole or one element; `where` names who asks.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is none of numbers.
+    """
+    wanted = ("local", "calculatedParameter", *PARAMETERS)
+    for together in (True, False) if arrays else (False,):
+        for quantity in _quantities(archive, arrays=together, wanted=wanted)[0]:
+            if quantity.name == name:
+                return quantity
+    known = {v.name: v for v in archive.description.modelVariables}
+    if name not in known:
+        raise ConfigurationError(
+            f"{where}: the FMU has no variable '{name}'\n  {nearest(name, known, what='it has')}"
+        )
+    variable = known[name]
+    raise ConfigurationError(
+        f"{where}: '{name}' is {variable.causality or 'local'} of type {variable.type}; it takes "
+        "local variables and parameters that are numbers"
+    )
+
+
+def _quantities(
+    archive: Archive, *, arrays: bool, wanted: Sequence[str] = (*CONNECTED, *PARAMETERS)
+) -> tuple[list[Quantity], list[str]]:
     """Inputs, outputs and parameters, elements of arrays together."""
-    wanted = ("input", "output", "parameter", "structuralParameter")
+    units = Units(archive)
     groups: dict[tuple[str, str], list[tuple[tuple[int, ...], Any]]] = {}
     left_out = []
     for variable in archive.description.modelVariables:
-        if variable.causality not in wanted:
+        causality = variable.causality or "local"
+        if causality not in wanted:
             continue
         if variable.type not in (*REAL, *INTEGER, *BOOLEAN):
             if variable.causality in ("input", "output"):
@@ -203,18 +231,18 @@ def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list
         match = None if not arrays or variable.dimensions else _ELEMENT.match(variable.name)
         name = match[1] if match else variable.name
         index = tuple(int(i) for i in match[2].split(",")) if match else ()
-        groups.setdefault((name, variable.causality), []).append((index, variable))
+        groups.setdefault((name, causality), []).append((index, variable))
     quantities = []
     for (name, _), members in groups.items():
         members.sort(key=lambda pair: pair[0])
         shape = _extent([index for index, _ in members])
         same = len({(v.type, v.variability) for _, v in members}) == 1
         if shape is not None and same:
-            made = _quantity(name, shape, [v for _, v in members])
+            made = _quantity(name, shape, [v for _, v in members], units)
             made.base = min(min(index) for index, _ in members) if shape else 1
             quantities.append(made)
         else:
-            quantities += [_quantity(v.name, (), [v]) for _, v in members]
+            quantities += [_quantity(v.name, (), [v], units) for _, v in members]
     return quantities, left_out
 
 
@@ -230,11 +258,13 @@ def _extent(indices: Sequence[tuple[int, ...]]) -> tuple[int, ...] | None:
     return shape if list(indices) == full and low.max() <= 1 else None
 
 
-def _quantity(name: str, shape: tuple[int, ...], members: Sequence[Any]) -> Quantity:
+def _quantity(
+    name: str, shape: tuple[int, ...], members: Sequence[Any], units_of: Units
+) -> Quantity:
     first = members[0]
     if first.dimensions or first.shape:
         shape = tuple(int(n) for n in (first.shape or ()))
-    units = tuple(_unit(v) for v in members)
+    units = tuple(units_of(v) for v in members)
     unit: Unit = units[0] if len(set(units)) == 1 else units
     if len(shape) == 2 and not isinstance(unit, str):
         last = units[: shape[-1]]
@@ -252,20 +282,40 @@ def _quantity(name: str, shape: tuple[int, ...], members: Sequence[Any]) -> Quan
     )
 
 
-def _unit(variable: Any) -> str:
-    unit = variable.unit
-    if unit is None and variable.declaredType is not None:
-        unit = variable.declaredType.unit
-    if unit is None or unit in ("", "-"):
-        return "1"
-    try:
-        check_unit(unit)
-    except ConfigurationError:
-        return "1"
-    return str(unit)
+class Units:
+    """Units of an FMU's variables: what its UnitDefinitions say, and where they say nothing, SI."""
+
+    def __init__(self, archive: Archive) -> None:
+        self._own = archive.annotation is not None
+        self._defined = {u.name: u.baseUnit for u in archive.description.unitDefinitions}
+        self._read: dict[str, str] = {}
+
+    def __call__(self, variable: Any) -> str:
+        """The unit of a variable."""
+        name = variable.unit
+        if name is None and variable.declaredType is not None:
+            name = variable.declaredType.unit
+        if name in (None, "", "-", "1"):
+            return "1"
+        if name not in self._read:
+            self._read[name] = self._meaning(str(name))
+        return self._read[name]
+
+    def _meaning(self, name: str) -> str:
+        base = self._defined.get(name)
+        if base is not None and not self._own:
+            powers = {symbol: int(getattr(base, symbol)) for symbol in SI_BASE}
+            return unit_by_definition(name, float(base.factor), powers, float(base.offset))
+        if not self._own:
+            return unit_by_name(name)
+        try:
+            check_unit(name)
+        except ConfigurationError:
+            return "1"
+        return name
 
 
-def _starts(members: Sequence[Any]) -> list[float] | None:
+def _starts(members: Sequence[Any]) -> list[float] | list[int] | None:
     texts = [v.start for v in members]
     if any(t is None for t in texts):
         return None
@@ -275,6 +325,9 @@ def _starts(members: Sequence[Any]) -> list[float] | None:
             words += text.split()
         else:
             words += [str(x) for x in np.asarray(text).ravel()]
+    kind = members[0].type
+    if kind in INTEGER:
+        return [whole_start(members[0].name, kind, w) for w in words]
     return [1.0 if w == "true" else 0.0 if w == "false" else float(w) for w in words]
 
 

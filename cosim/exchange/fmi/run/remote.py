@@ -237,6 +237,7 @@ class RemoteFleet:
         self.inputs = np.zeros((n_members, sum(g.size for g in setup.inputs)))
         self.outputs = np.zeros((n_members, sum(g.size for g in setup.outputs)))
         self.driven = False
+        self._log: Sequence[tuple[int, int, str]] = ()
         self._limit = limit + FIRST_LIMIT if apart else limit  # each member has `limit`
         self._worker = Worker(MODULE, f"the FMU '{setup.file}'")
         own_limit = limit if apart else None
@@ -257,9 +258,15 @@ class RemoteFleet:
         return self._exchange("step", t, h, messages, skipped)
 
     def _exchange(self, name: str, *arguments: Any) -> Failures:
-        failures, outputs = self._worker.call(name, self.inputs, *arguments, limit=self._limit)
+        answer = self._worker.call(name, self.inputs, *arguments, limit=self._limit)
+        failures, outputs, self._log = answer
         self.outputs[...] = outputs
         return dict(failures)
+
+    def take_log(self) -> Sequence[tuple[int, int, str]]:
+        """As `Fleet.take_log`."""
+        found, self._log = self._log, ()
+        return found
 
     def save(self) -> list[bytes]:
         """As `Fleet.save`."""

@@ -10,7 +10,7 @@ from importlib.metadata import version as installed
 from xml.etree import ElementTree as ET
 
 from terrafix.cosim.basics.clock import text_seconds
-from terrafix.cosim.basics.units import base_units
+from terrafix.cosim.basics.units import base_offset, base_units
 from terrafix.cosim.exchange.fmi.write.dependencies import Dependencies, Unknown
 from terrafix.cosim.exchange.fmi.write.layout import Layout
 from terrafix.cosim.exchange.fmi.write.variables import Variable
@@ -87,6 +87,8 @@ class _Writer:
                 attributes = {k: str(p) for k, p in exponents.items()}
                 if factor != 1.0:
                     attributes["factor"] = number(factor)
+                if offset := base_offset(name):
+                    attributes["offset"] = number(offset)
                 ET.SubElement(unit, "BaseUnit", attributes)
 
     def units_of(self, variable: Variable) -> Iterable[str]:
