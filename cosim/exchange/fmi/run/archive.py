@@ -178,6 +178,15 @@ def checked_xml(path: Path, file: Path) -> bytes:
     return data
 
 
+def _bound_unsigned(root: Any, description: Any) -> None:
+    """Read the bounds of unsigned integers, which FMPy leaves out."""
+    variables = {v.name: v for v in description.modelVariables if v.type.startswith("UInt")}
+    for element in root.iter() if variables else ():
+        if element.tag.startswith("UInt") and element.get("name") in variables:
+            variable = variables[element.get("name")]
+            variable.min, variable.max = element.get("min"), element.get("max")
+
+
 def _read(file: Path, folder: Path) -> Archive:
     from xml.etree import ElementTree as ET
 
@@ -206,6 +215,7 @@ def _read(file: Path, folder: Path) -> Archive:
             f"'{file}': modelDescription.xml cannot be understood: {why}\n"
             "  ask for another from the tool that wrote it"
         ) from error
+    _bound_unsigned(root, description)
     directional = any(
         each.get(name) in ("true", "1")
         for tag in ("CoSimulation", "ModelExchange")

@@ -305,6 +305,12 @@ class Instance:
         sizes = () if self._version == 2 else (ct.c_size_t(len(flat)),)
         self.call(f"Set{name}", vr, ct.c_size_t(len(vr)), array, *sizes)
 
+    def set_texts(self, vr: Any, texts: Sequence[str]) -> None:
+        """Set variables of text."""
+        array = (ct.c_char_p * max(len(texts), 1))(*(text.encode() for text in texts))
+        sizes = () if self._version == 2 else (ct.c_size_t(len(texts)),)
+        self.call("SetString", vr, ct.c_size_t(len(vr)), array, *sizes)
+
     # ------------------------------------------------------------------ co-simulation
 
     def step(self, t: float, h: float) -> None:

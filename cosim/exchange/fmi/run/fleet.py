@@ -26,6 +26,7 @@ from terrafix.cosim.exchange.fmi.run.binding import (
     load_library,
     references,
 )
+from terrafix.cosim.exchange.fmi.run.parameters import Start
 from terrafix.cosim.exchange.fmi.run.solvers import Integrator
 from terrafix.cosim.kernels import toolchain
 
@@ -64,8 +65,8 @@ class Setup:
         Of the component.
     inputs, outputs : tuple of Group
         What is set before and read after each step.
-    starts : tuple of (str, tuple of int, tuple of float)
-        Type, value references and values set before initialization.
+    starts : tuple of Start
+        Values set before initialization.
     solver : str
     tolerance : float
     """
@@ -75,8 +76,7 @@ class Setup:
     name: str
     inputs: tuple[Group, ...]
     outputs: tuple[Group, ...]
-    starts: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
-    each: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
+    starts: tuple[Start, ...] = ()
     solver: str = "cvode"
     tolerance: float = 1e-10
 
@@ -225,10 +225,12 @@ class Fleet:
 
     def _start_one(self, row: int, messages: Sequence[Message]) -> None:
         instance = self.instances[row] = Instance(self.library, f"{self.setup.name}_{row}")
-        for kind, vr, values in self.setup.starts:
-            instance.set(kind, references(vr), values)
-        for kind, vr, values in self.setup.each:
-            instance.set(kind, references(vr), values[row])
+        structural = [s for s in self.setup.starts if s.structural]
+        if structural:
+            instance.call("EnterConfigurationMode")
+            self._set_starts(instance, row, structural)
+            instance.call("ExitConfigurationMode")
+        self._set_starts(instance, row, [s for s in self.setup.starts if not s.structural])
         instance.begin(0.0)
         self._set_all(instance, row)
         for message in messages:
@@ -239,6 +241,17 @@ class Fleet:
                 instance, self.archive, 0.0, self.setup.solver, self.setup.tolerance
             )
         self._get_all(instance, row)
+
+    def _set_starts(self, instance: Instance, row: int, starts: Sequence[Start]) -> None:
+        for start in starts:
+            vr, rows = references(start.references), start.rows
+            try:
+                if isinstance(rows, tuple):
+                    instance.set_texts(vr, rows)
+                else:
+                    instance.set(start.kind, vr, rows[row if len(rows) > 1 else 0])
+            except FmuError as error:
+                raise FmuError(f"its '{start.name}' was refused: {error}", error.status) from error
 
     def _set_all(self, instance: Instance, row: int) -> None:
         for group in self.setup.inputs:

@@ -9,7 +9,7 @@ identifiers are written with underscores.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,6 +27,7 @@ INTEGER = (
     *("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16"),
     *("Int32", "UInt32", "Int64", "UInt64"),
 )
+PARAMETERS = ("parameter", "structuralParameter")
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\d+)*)\]\Z")
 
 
@@ -49,6 +50,10 @@ class Quantity:
     doc : str
     base : int
         Index of the first element, in names.
+    variables : sequence
+        As FMPy read them.
+    texts : list of str or None
+        Start values of a String.
     """
 
     name: str
@@ -61,6 +66,8 @@ class Quantity:
     variability: str = "continuous"
     doc: str = ""
     base: int = 1
+    variables: Sequence[Any] = ()
+    texts: list[str] | None = None
 
     @property
     def size(self) -> int:
@@ -122,6 +129,8 @@ class Interface:
         ``"co-simulation"`` or ``"model exchange"``: how it is run.
     ports : list of ImportedPort
     parameters : dict of str to Quantity
+        Numbers.
+    text_parameters : dict of str to Quantity
     left_out : list of str
         Inputs and outputs of types that have no port (text, binary, clocks).
     state, serialize : bool
@@ -138,10 +147,25 @@ class Interface:
     state: bool
     serialize: bool
     own: bool
+    text_parameters: dict[str, Quantity] = field(default_factory=dict)
+
+    @property
+    def said_of_parameters(self) -> list[Any]:
+        """What the annotation says of parameters: frames, and which must be positive."""
+        found = self.archive.annotation
+        return [] if found is None else list(found.iter("Parameter"))
 
 
-def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True) -> Interface:
+def read_interface(
+    archive: Archive,
+    kind: str = "auto",
+    *,
+    arrays: bool = True,
+    sizes: Mapping[int, int] | None = None,
+) -> Interface:
     """Read ports, parameters and capabilities; without `arrays`, every scalar is a port.
+
+    `sizes` are values of structural parameters by reference, where they are not the start values.
 
     Raises
     ------
@@ -166,33 +190,38 @@ def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True)
             f'  write kind = "{offered[0]}", or leave it out'
         )
     interface = description.coSimulation if chosen == CO_SIMULATION else description.modelExchange
-    quantities, left_out = _quantities(archive, arrays=arrays)
+    quantities, left_out = _quantities(archive, arrays=arrays, sizes=sizes or {})
+    parameters = [q for q in quantities if q.causality in PARAMETERS]
     found = archive.annotation if arrays else None
     ports = _own_ports(archive, found, quantities) if found is not None else _ports(quantities)
     return Interface(
         archive,
         chosen,
         ports,
-        {q.name: q for q in quantities if q.causality in ("parameter", "structuralParameter")},
+        {q.name: q for q in parameters if q.kind != "String"},
         left_out,
         bool(interface.canGetAndSetFMUstate),
         bool(interface.canGetAndSetFMUstate and interface.canSerializeFMUstate),
         own=archive.annotation is not None,
+        text_parameters={q.name: q for q in parameters if q.kind == "String"},
     )
 
 
 # --------------------------------------------------------------------------------- variables
 
 
-def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list[str]]:
+def _quantities(
+    archive: Archive, *, arrays: bool, sizes: Mapping[int, int]
+) -> tuple[list[Quantity], list[str]]:
     """Inputs, outputs and parameters, elements of arrays together."""
-    wanted = ("input", "output", "parameter", "structuralParameter")
+    wanted = ("input", "output", *PARAMETERS)
     groups: dict[tuple[str, str], list[tuple[tuple[int, ...], Any]]] = {}
     left_out = []
     for variable in archive.description.modelVariables:
         if variable.causality not in wanted:
             continue
-        if variable.type not in (*REAL, *INTEGER, *BOOLEAN):
+        text = variable.type == "String" and variable.causality in PARAMETERS
+        if not text and variable.type not in (*REAL, *INTEGER, *BOOLEAN):
             if variable.causality in ("input", "output"):
                 left_out.append(variable.name)
             continue
@@ -206,11 +235,11 @@ def _quantities(archive: Archive, *, arrays: bool) -> tuple[list[Quantity], list
         shape = _extent([index for index, _ in members])
         same = len({(v.type, v.variability) for _, v in members}) == 1
         if shape is not None and same:
-            made = _quantity(name, shape, [v for _, v in members])
+            made = _quantity(name, shape, [v for _, v in members], sizes)
             made.base = min(min(index) for index, _ in members) if shape else 1
             quantities.append(made)
         else:
-            quantities += [_quantity(v.name, (), [v]) for _, v in members]
+            quantities += [_quantity(v.name, (), [v], sizes) for _, v in members]
     return quantities, left_out
 
 
@@ -226,26 +255,45 @@ def _extent(indices: Sequence[tuple[int, ...]]) -> tuple[int, ...] | None:
     return shape if list(indices) == full and low.max() <= 1 else None
 
 
-def _quantity(name: str, shape: tuple[int, ...], members: Sequence[Any]) -> Quantity:
+def _quantity(
+    name: str, shape: tuple[int, ...], members: Sequence[Any], sizes: Mapping[int, int]
+) -> Quantity:
     first = members[0]
     if first.dimensions or first.shape:
-        shape = tuple(int(n) for n in (first.shape or ()))
+        shape = tuple(
+            sizes.get(d.valueReference, n) if d.start is None else n
+            for d, n in zip(first.dimensions, map(int, first.shape or ()), strict=True)
+        )
     units = tuple(_unit(v) for v in members)
     unit: Unit = units[0] if len(set(units)) == 1 else units
     if len(shape) == 2 and not isinstance(unit, str):
         last = units[: shape[-1]]
         unit = last if units == last * shape[0] else "1"
+    text = first.type == "String"
+    size = int(np.prod(shape, dtype=np.int64))
+    starts = None if text else _starts(members)
+    if starts is not None and len(starts) != size:  # of the size that it has otherwise
+        starts = starts * size if len(starts) == 1 else None
     return Quantity(
         name,
         first.type,
         [int(v.valueReference) for v in members],
         shape,
         unit,
-        _starts(members),
+        starts,
         first.causality,
         first.variability or "continuous",
         " ".join((first.description or "").split()),
+        variables=tuple(members),
+        texts=_texts(members, size) if text else None,
     )
+
+
+def _texts(members: Sequence[Any], size: int) -> list[str] | None:
+    found: list[str] = []
+    for text in (v.start for v in members):
+        found += [] if text is None else [text] if isinstance(text, str) else [str(t) for t in text]
+    return found if len(found) == size else None
 
 
 def _unit(variable: Any) -> str:

@@ -1,0 +1,165 @@
+"""FMUs that nobody here exported: built by the tests from C of their own."""
+
+from __future__ import annotations
+
+import zipfile
+
+from terrafix.cosim.exchange.fmi.run.platforms import host_platform
+from terrafix.cosim.exchange.fmi.write.binaries import build
+
+HEAD = """
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+#define F __attribute__((visibility("default")))
+"""
+
+
+def make_fmu(path, source, description, *, fmi, defines=""):
+    """Write an FMU of one C file; `description` is what stands in fmiModelDescription."""
+    binary = build({"model.c": HEAD + defines + source}, ["model.c"], (None,))[host_platform()]
+    names = {2: 'fmiVersion="2.0" guid="t"', 3: 'fmiVersion="3.0" instantiationToken="t"'}
+    xml = f'<fmiModelDescription {names[fmi]} modelName="m">{description}</fmiModelDescription>'
+    host = host_platform()
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", xml)
+        archive.writestr(f"binaries/{host.folder(fmi)}/m{host.suffix}", binary)
+    return path
+
+
+# ------------------------------------------------------------------ parameters of all types, FMI 2
+
+SETTINGS = """
+struct m { double k, y[5]; int n, mode, on; char word[32]; };
+static struct m *of(void *c) { return c; }
+F void *fmi2Instantiate(const char *a, int b, const char *c, const char *d, const void *e, int f,
+                        int g)
+{
+    struct m *i = calloc(1, sizeof *i);
+    i->k = 2.0, i->n = 3, i->mode = 7;
+    strcpy(i->word, "start");
+    return i;
+}
+F void fmi2FreeInstance(void *c) { free(c); }
+F int fmi2SetupExperiment(void *c, int a, double b, double d, int e, double f) { return 0; }
+F int fmi2EnterInitializationMode(void *c) { return 0; }
+F int fmi2ExitInitializationMode(void *c) { return 0; }
+F int fmi2Terminate(void *c) { return 0; }
+F int fmi2DoStep(void *c, double t, double h, int b) { return 0; }
+F int fmi2SetReal(void *c, const uint32_t *vr, size_t n, const double *v)
+{
+    if (v[0] == 13.0) return 3;
+    of(c)->k = v[0];
+    return 0;
+}
+F int fmi2SetInteger(void *c, const uint32_t *vr, size_t n, const int *v)
+{
+    for (size_t j = 0; j < n; j++) *(vr[j] == 1 ? &of(c)->n : &of(c)->mode) = v[j];
+    return 0;
+}
+F int fmi2SetBoolean(void *c, const uint32_t *vr, size_t n, const int *v)
+{
+    of(c)->on = v[0];
+    return 0;
+}
+F int fmi2SetString(void *c, const uint32_t *vr, size_t n, const char *const *v)
+{
+    strncpy(of(c)->word, v[0], 31);
+    return 0;
+}
+F int fmi2GetReal(void *c, const uint32_t *vr, size_t n, double *v)
+{
+    struct m *i = c;
+    double y[] = {i->k, i->n, i->mode, i->on, i->word[0]};
+    for (size_t j = 0; j < n; j++) v[j] = y[vr[j] - 10];
+    return 0;
+}
+"""
+
+SETTINGS_XML = """
+<CoSimulation modelIdentifier="m"/>
+<UnitDefinitions><Unit name="kg"><BaseUnit kg="1"/></Unit></UnitDefinitions>
+<TypeDefinitions><SimpleType name="Mode"><Enumeration>
+  <Item name="off" value="3"/><Item name="slow" value="7"/><Item name="fast" value="9"/>
+</Enumeration></SimpleType></TypeDefinitions>
+<ModelVariables>
+  <ScalarVariable name="body.k" valueReference="0" causality="parameter" variability="fixed"
+    description="mass of the body"><Real start="2.0" unit="kg" min="1" max="20"/></ScalarVariable>
+  <ScalarVariable name="tolerance" valueReference="1" causality="parameter" variability="fixed">
+    <Integer start="3" min="0"/></ScalarVariable>
+  <ScalarVariable name="mode" valueReference="2" causality="parameter" variability="fixed">
+    <Enumeration declaredType="Mode" start="7"/></ScalarVariable>
+  <ScalarVariable name="on" valueReference="3" causality="parameter" variability="fixed">
+    <Boolean start="false"/></ScalarVariable>
+  <ScalarVariable name="word" valueReference="4" causality="parameter" variability="fixed">
+    <String start="start"/></ScalarVariable>
+  <ScalarVariable name="y[1]" valueReference="10" causality="output"><Real/></ScalarVariable>
+  <ScalarVariable name="y[2]" valueReference="11" causality="output"><Real/></ScalarVariable>
+  <ScalarVariable name="y[3]" valueReference="12" causality="output"><Real/></ScalarVariable>
+  <ScalarVariable name="y[4]" valueReference="13" causality="output"><Real/></ScalarVariable>
+  <ScalarVariable name="y[5]" valueReference="14" causality="output"><Real/></ScalarVariable>
+</ModelVariables>
+<ModelStructure><Outputs><Unknown index="6"/><Unknown index="7"/><Unknown index="8"/>
+<Unknown index="9"/><Unknown index="10"/></Outputs></ModelStructure>
+"""
+
+# ------------------------------------------------------------------ a structural parameter, FMI 3
+
+SIZED = """
+struct m { uint64_t n; int configuring; double k[9], u[9]; };
+static struct m *of(void *c) { return c; }
+F void *fmi3InstantiateCoSimulation(const char *a, const char *b, const char *c, bool d, bool e,
+    bool f, bool g, const uint32_t h[], size_t i, void *j, void *k, void *l)
+{
+    struct m *made = calloc(1, sizeof *made);
+    made->n = 2;
+    for (int j = 0; j < 9; j++) made->k[j] = j + 1;
+    return made;
+}
+F void fmi3FreeInstance(void *c) { free(c); }
+F int fmi3EnterConfigurationMode(void *c) { of(c)->configuring = 1; return 0; }
+F int fmi3ExitConfigurationMode(void *c) { of(c)->configuring = 0; return 0; }
+F int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool e, double f) { return 0; }
+F int fmi3ExitInitializationMode(void *c) { return 0; }
+F int fmi3Terminate(void *c) { return 0; }
+F int fmi3DoStep(void *c, double t, double h, bool a, bool *b, bool *d, bool *e, double *last)
+{
+    *b = *d = *e = false;
+    *last = t + h;
+    return 0;
+}
+F int fmi3SetUInt64(void *c, const uint32_t *vr, size_t n, const uint64_t *v, size_t m)
+{
+    if (!of(c)->configuring) return 3;
+    of(c)->n = v[0];
+    return 0;
+}
+F int fmi3SetFloat64(void *c, const uint32_t *vr, size_t n, const double *v, size_t m)
+{
+    struct m *i = c;
+    if (m != n * i->n) return 3;
+    for (size_t j = 0; j < n; j++) memcpy(vr[j] == 1 ? i->k : i->u, v + j * i->n, 8 * i->n);
+    return 0;
+}
+F int fmi3GetFloat64(void *c, const uint32_t *vr, size_t n, double *v, size_t m)
+{
+    v[0] = 0.0;
+    for (uint64_t j = 0; j < of(c)->n; j++) v[0] += of(c)->k[j] * of(c)->u[j];
+    return 0;
+}
+"""
+
+SIZED_XML = """
+<CoSimulation modelIdentifier="m"/>
+<ModelVariables>
+  <UInt64 name="n" valueReference="0" causality="structuralParameter" start="2" min="1" max="9"/>
+  <Float64 name="k" valueReference="1" causality="parameter" start="1 2">
+    <Dimension valueReference="0"/></Float64>
+  <Float64 name="u" valueReference="2" causality="input" start="1 1">
+    <Dimension valueReference="0"/></Float64>
+  <Float64 name="y" valueReference="3" causality="output"/>
+</ModelVariables>
+<ModelStructure><Output valueReference="3"/></ModelStructure>
+"""
