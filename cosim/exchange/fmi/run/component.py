@@ -43,6 +43,7 @@ from terrafix.cosim.exchange.fmi.run.parameters import (
     start_values,
 )
 from terrafix.cosim.exchange.fmi.run.reading import (
+    REAL,
     ImportedPort,
     Interface,
     Quantity,
@@ -326,7 +327,8 @@ class Fmu(Component):
         written = [(p.name, n, q) for p in self._outputs for n, (q, _) in p.fields.items()]
         written += [(p.name, "t", p.t) for p in self._outputs if p.t]
         written += [(p.name, "sequence", p.sequence) for p in self._outputs if p.sequence]
-        inputs, self._input_at = grouped(read)
+        apart = interface.kind != CO_SIMULATION
+        inputs, self._input_at = grouped(read, discrete_apart=apart)
         outputs, self._output_at = grouped(written)
         setup = Setup(
             str(Path(self.given_parameters["file"]).absolute()),
@@ -522,18 +524,25 @@ def _is_something(name: str) -> bool:
 
 
 def grouped(
-    quantities: Sequence[tuple[str, str, Quantity]],
+    quantities: Sequence[tuple[str, str, Quantity]], *, discrete_apart: bool = False
 ) -> tuple[tuple[Group, ...], dict[tuple[str, str], slice]]:
-    """Gather quantities by type, side by side in a row; where each one stands."""
-    kinds = list(dict.fromkeys(q.kind for _, _, q in quantities))
+    """Gather quantities by type, side by side in a row; where each one stands.
+
+    With `discrete_apart`, what is set in event mode alone is not mixed with what is continuous.
+    """
+
+    def key(q: Quantity) -> tuple[str, bool]:
+        return q.kind, discrete_apart and (q.variability == "discrete" or q.kind not in REAL)
+
+    kinds = list(dict.fromkeys(key(q) for _, _, q in quantities))
     groups, where, at = [], {}, 0
-    for kind in kinds:
+    for kind, discrete in kinds:
         first, references = at, []
         for port, name, q in quantities:
-            if q.kind != kind:
+            if key(q) != (kind, discrete):
                 continue
             references += q.references
             where[port, name] = slice(at, at + q.size)
             at += q.size
-        groups.append(Group(kind, tuple(references), first, at - first))
+        groups.append(Group(kind, tuple(references), first, at - first, discrete))
     return tuple(groups), where

@@ -50,6 +50,7 @@ class Group:
     references: tuple[int, ...]
     start: int
     size: int
+    discrete: bool = False
 
 
 @dataclass(frozen=True)
@@ -198,6 +199,13 @@ class Fleet:
         self.outputs = np.zeros((n_members, sum(g.size for g in setup.outputs)))
         self.instances: list[Instance | None] = [None] * n_members
         self._integrators: dict[int, Integrator] = {}
+        self._discrete = np.concatenate(
+            [
+                np.arange(0),
+                *(np.arange(g.start, g.start + g.size) for g in setup.inputs if g.discrete),
+            ]
+        )
+        self._last: dict[int, FloatArray] = {}  # discrete inputs as they were set
         self._active = np.zeros(n_members, dtype=np.uint8)
         self._failed = np.zeros(n_members, dtype=np.uint8)
         self._references = {g: references(g.references) for g in (*setup.inputs, *setup.outputs)}
@@ -240,6 +248,7 @@ class Fleet:
             self._integrators[row] = Integrator(
                 instance, self.archive, 0.0, self.setup.solver, self.setup.tolerance
             )
+            self._last[row] = self.inputs[row, self._discrete]
         self._get_all(instance, row)
 
     def _set_starts(self, instance: Instance, row: int, starts: Sequence[Start]) -> None:
@@ -253,8 +262,12 @@ class Fleet:
             except FmuError as error:
                 raise FmuError(f"its '{start.name}' was refused: {error}", error.status) from error
 
-    def _set_all(self, instance: Instance, row: int) -> None:
+    def _set_all(
+        self, instance: Instance, row: int, *, discrete: tuple[bool, ...] = (False, True)
+    ) -> None:
         for group in self.setup.inputs:
+            if group.discrete not in discrete:
+                continue
             values = self.inputs[row, group.start : group.start + group.size]
             instance.set(group.kind, self._references[group], values)
 
@@ -359,12 +372,24 @@ class Fleet:
             return
         instance = self.instances[row]
         assert instance is not None
-        self._set_all(instance, row)
         if row in self._integrators:
-            self._integrators[row].advance(t, h)
+            self._advance(self._integrators[row], instance, row, t, h)
         else:
+            self._set_all(instance, row)
             instance.step(t, h)
         self._get_all(instance, row)
+
+    def _advance(
+        self, integrator: Integrator, instance: Instance, row: int, t: float, h: float
+    ) -> None:
+        """Integrate over a step; discrete inputs that changed are set in event mode."""
+        now = self.inputs[row, self._discrete]
+        if np.array_equal(now, self._last.get(row, now)):
+            self._set_all(instance, row, discrete=(False,))
+        else:
+            integrator.handle(t, lambda: self._set_all(instance, row))
+            self._last[row] = now
+        integrator.advance(t, h)
 
     def _explain(self) -> Failures:
         found: Failures = {}
@@ -394,6 +419,7 @@ class Fleet:
                 instance.deserialize(bytes(data))
                 if row in self._integrators:
                     self._integrators[row].restart()
+                    self._last[row] = np.full(len(self._discrete), np.nan)  # they are set anew
 
     def mark(self) -> None:
         """Keep the present state of every instance that is stepped, to return to."""

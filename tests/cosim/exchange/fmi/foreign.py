@@ -163,3 +163,126 @@ SIZED_XML = """
 </ModelVariables>
 <ModelStructure><Output valueReference="3"/></ModelStructure>
 """
+
+# ------------------------------------------------------------------ strict model exchange, FMI 2
+
+STRICT = """
+enum { START, INIT, EVENT, CONTINUOUS };
+struct m { int mode, b, count; double t, x, u, next; };
+struct info { int again, end, nominals, states, defined; double time; };
+static struct m *of(void *c) { return c; }
+F void *fmi2Instantiate(const char *a, int b, const char *c, const char *d, const void *e, int f,
+                        int g)
+{
+    struct m *i = calloc(1, sizeof *i);
+    i->next = 0.25;
+    return i;
+}
+F void fmi2FreeInstance(void *c) { free(c); }
+F int fmi2SetupExperiment(void *c, int a, double b, double d, int e, double f) { return 0; }
+F int fmi2EnterInitializationMode(void *c) { of(c)->mode = INIT; return 0; }
+F int fmi2ExitInitializationMode(void *c) { of(c)->mode = EVENT; return 0; }
+F int fmi2EnterEventMode(void *c)
+{
+    if (of(c)->mode != CONTINUOUS) return 3;
+    of(c)->mode = EVENT;
+    return 0;
+}
+F int fmi2EnterContinuousTimeMode(void *c)
+{
+    if (of(c)->mode != EVENT) return 3;
+    of(c)->mode = CONTINUOUS;
+    return 0;
+}
+F int fmi2NewDiscreteStates(void *c, struct info *e)
+{
+    struct m *i = c;
+    if (i->mode != EVENT) return 3;
+    memset(e, 0, sizeof *e);
+    if (i->t >= i->next && !STUCK) i->count++, i->next += 0.25;
+    e->end = ENDS && i->count == 2;
+    e->defined = 1;
+    e->time = i->next;
+    return 0;
+}
+F int fmi2CompletedIntegratorStep(void *c, int a, int *event, int *end)
+{
+    *event = *end = 0;
+    return 0;
+}
+F int fmi2Terminate(void *c) { return 0; }
+F int fmi2SetTime(void *c, double t)
+{
+    if (of(c)->mode != CONTINUOUS) return 3; /* Dymola 2022x: not allowed in this state */
+    of(c)->t = t;
+    return 0;
+}
+F int fmi2GetContinuousStates(void *c, double *x, size_t n)
+{
+    if (!NX) return 3;
+    x[0] = of(c)->x;
+    return 0;
+}
+F int fmi2SetContinuousStates(void *c, const double *x, size_t n)
+{
+    if (!NX) return 3;
+    of(c)->x = x[0];
+    return 0;
+}
+F int fmi2GetDerivatives(void *c, double *x, size_t n)
+{
+    if (!NX) return 3;
+    x[0] = of(c)->u;
+    return 0;
+}
+F int fmi2GetNominalsOfContinuousStates(void *c, double *x, size_t n) { x[0] = 0.0; return 0; }
+F int fmi2GetEventIndicators(void *c, double *x, size_t n) { return 3; }
+static int settable(struct m *i) { return i->mode == INIT || i->mode == EVENT ? 0 : 3; }
+F int fmi2SetReal(void *c, const uint32_t *vr, size_t n, const double *v)
+{
+    of(c)->u = v[0];
+    return settable(c);
+}
+F int fmi2SetBoolean(void *c, const uint32_t *vr, size_t n, const int *v)
+{
+    of(c)->b = v[0];
+    return settable(c);
+}
+F int fmi2GetReal(void *c, const uint32_t *vr, size_t n, double *v)
+{
+    struct m *i = c;
+    double y[] = {i->x, i->count, i->u + 10 * i->b};
+    for (size_t j = 0; j < n; j++) v[j] = y[vr[j] - 10];
+    return 0;
+}
+"""
+
+STRICT_XML = """
+<ModelExchange modelIdentifier="m"/>
+<ModelVariables>
+  <ScalarVariable name="u" valueReference="0" causality="input" variability="discrete">
+    <Real start="0"/></ScalarVariable>
+  <ScalarVariable name="b" valueReference="1" causality="input" variability="discrete">
+    <Boolean start="false"/></ScalarVariable>
+  <ScalarVariable name="y[1]" valueReference="10" causality="output"><Real/></ScalarVariable>
+  <ScalarVariable name="y[2]" valueReference="11" causality="output"><Real/></ScalarVariable>
+  <ScalarVariable name="y[3]" valueReference="12" causality="output"><Real/></ScalarVariable>
+  <ScalarVariable name="x" valueReference="20"><Real/></ScalarVariable>
+  <ScalarVariable name="der(x)" valueReference="21"><Real derivative="6"/></ScalarVariable>
+</ModelVariables>
+<ModelStructure><Outputs><Unknown index="3"/><Unknown index="4"/><Unknown index="5"/></Outputs>
+STATES</ModelStructure>
+"""
+
+
+def strict(path, *, n_states, ends=False, stuck=False):
+    """Write a model that refuses every call that its mode does not allow.
+
+    x' = u with discrete inputs u and b, a time event every 0.25 s, the first wanted from the start;
+    y = (x, number of events, u + 10 b). With `ends`, the second event ends the simulation; with
+    `stuck`, time events are asked for again and again.
+    """
+    states = '<Derivatives><Unknown index="7"/></Derivatives>' if n_states else ""
+    defines = f"#define NX {n_states}\n#define ENDS {int(ends)}\n#define STUCK {int(stuck)}\n"
+    xml = STRICT_XML.replace("STATES", states)
+    return make_fmu(path, STRICT, xml, fmi=2, defines=defines)
