@@ -139,6 +139,8 @@ class Environment:
         ``fail(mask, reason)`` excludes members from here on.
     quiet : bool
         Every draw of noise is zero: the nominal run, about which errors are linearized.
+    end : callable, optional
+        ``end(mask, reason)`` ends the runs of members when this tick is over, which is no failure.
     """
 
     path: str
@@ -147,6 +149,7 @@ class Environment:
     active: Mask
     fail: Callable[[Mask, str], None]
     quiet: bool = False
+    end: Callable[[Mask, str], None] | None = None
 
     @property
     def n_members(self) -> int:
@@ -475,6 +478,11 @@ class Component(Shown):
     def fail(self, mask: ArrayLike, reason: str) -> None:
         """Exclude the members in `mask` (n_members,) from here on, with a reason."""
         self.environment.fail(np.asarray(mask, dtype=np.bool_), reason)
+
+    def end_run(self, mask: ArrayLike, reason: str) -> None:
+        """End the runs of the members in `mask` (n_members,) after this tick: they are complete."""
+        end = self.environment.end or self.environment.fail
+        end(np.asarray(mask, dtype=np.bool_), reason)
 
     def get_state(self) -> dict[str, Any]:
         """Arrays and plain values that reproduce this component."""

@@ -21,6 +21,9 @@ from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
 from terrafix.cosim.exchange.fmi.run.archive import Archive
 
 CO_SIMULATION, MODEL_EXCHANGE = "co-simulation", "model exchange"
+ENDED = "the FMU asks to end the simulation"
+DISCARD = 2
+_TERMINATED = 3  # of fmi2StatusKind
 STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 _TYPES: dict[str, tuple[str, Any]] = {  # of the variable: (in function names, of ctypes)
     "Real": ("Real", ct.c_double),
@@ -54,6 +57,10 @@ class FmuError(TerrafixError):
     def __init__(self, text: str, status: int = 3) -> None:
         super().__init__(text)
         self.status = status
+
+
+class FmuEndedError(FmuError):
+    """An FMU that ended its simulation, as it may."""
 
 
 class _Logger2(ct.Structure):
@@ -316,16 +323,32 @@ class Instance:
     def step(self, t: float, h: float) -> None:
         """Advance from `t` by `h` [s]."""
         if self._version == 2:
-            self.call("DoStep", ct.c_double(t), ct.c_double(h), 1)
+            try:
+                self.call("DoStep", ct.c_double(t), ct.c_double(h), 1)
+            except FmuError as error:
+                if error.status == DISCARD and self.ended():
+                    raise FmuEndedError(ENDED) from error
+                raise
             return
         flags = [ct.c_bool() for _ in range(3)]
         last = ct.c_double()
         self.call("DoStep", ct.c_double(t), ct.c_double(h), ct.c_bool(True),
                   *(ct.byref(f) for f in flags), ct.byref(last))  # fmt: skip
         if flags[1].value:
-            raise FmuError(f"the FMU asks to end the simulation at t = {last.value:.9g} s")
+            raise FmuEndedError(f"the FMU asks to end the simulation at t = {last.value:.9g} s")
         if flags[2].value and last.value < t + h:
             raise FmuError(f"the FMU returned early, at t = {last.value:.9g} s")
+
+    def ended(self) -> bool:
+        """Whether it ended its simulation with the step that it discarded (FMI 2)."""
+        if self._version != 2 or not self.library.has("GetBooleanStatus"):
+            return False
+        value = ct.c_int()
+        try:
+            self.call("GetBooleanStatus", _TERMINATED, ct.byref(value))
+        except FmuError:
+            return False
+        return bool(value.value)
 
     # ------------------------------------------------------------------ state
 
@@ -408,7 +431,7 @@ class Instance:
                 changed |= bool(flags[3].value)
                 defined, time = flags[4].value, next_time.value
             if end:
-                raise FmuError("the FMU asks to end the simulation")
+                raise FmuEndedError(ENDED)
             if not again:
                 return changed, (float(time) if defined else None)
         raise FmuError("discrete states did not settle in 1000 updates")
@@ -424,7 +447,7 @@ class Instance:
         true = 1 if self._version == 2 else ct.c_bool(True)
         self.call("CompletedIntegratorStep", true, ct.byref(event), ct.byref(end))
         if end.value:
-            raise FmuError("the FMU asks to end the simulation")
+            raise FmuEndedError(ENDED)
         return bool(event.value)
 
     def get_vector(self, name: str, n: int) -> FloatArray:

@@ -34,7 +34,7 @@ from terrafix.cosim.declare.ports import (
 )
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
-from terrafix.cosim.exchange.fmi.run.fleet import Failures, Fleet, Group, Message, Setup
+from terrafix.cosim.exchange.fmi.run.fleet import Ended, Failures, Fleet, Group, Message, Setup
 from terrafix.cosim.exchange.fmi.run.parameters import (
     Size,
     Start,
@@ -453,7 +453,7 @@ class Fmu(Component):
         for row, text in failures.items():
             mask = np.zeros(self.n_members, dtype=np.bool_)
             mask[row] = True
-            self.fail(mask, text)
+            (self.end_run if isinstance(text, Ended) else self.fail)(mask, text)
 
     # ------------------------------------------------------------------ messages
 

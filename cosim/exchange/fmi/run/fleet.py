@@ -21,6 +21,9 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import (
     CO_SIMULATION,
+    DISCARD,
+    ENDED,
+    FmuEndedError,
     FmuError,
     Instance,
     load_library,
@@ -31,14 +34,25 @@ from terrafix.cosim.exchange.fmi.run.solvers import Integrator
 from terrafix.cosim.kernels import toolchain
 
 Failures = dict[int, str]
-"""Row of a member to what went wrong."""
+"""Row of a member to what went wrong, or to an `Ended`."""
+
+
+class Ended(str):
+    """What is said of a member whose FMU ended the simulation, as it may."""
+
+
+def _said(error: FmuError) -> str:
+    return Ended(error) if isinstance(error, FmuEndedError) else str(error)
+
+
 _DOUBLE = ("Real", "Float64")
-_STEP, _NOT_FINITE = 2, 4  # of `enum failure` in driver.c
+_STEP, _NOT_FINITE, _ENDED, _DISCARDED = 2, 4, 5, 6  # of `enum failure` in driver.c
 _REASONS = {
     1: "Set: inputs were refused",
     2: "DoStep did not succeed",
     3: "Get: outputs could not be read",
-    5: "DoStep: the FMU asks to end the simulation, or returned early",
+    6: "DoStep did not succeed",
+    7: "DoStep: the FMU returned early",
 }
 
 
@@ -136,10 +150,13 @@ class _Quick:
         self._t.value, self._h.value = t, h
         if self._set is not None and self._set(*self._set_arguments) > 1:
             raise FmuError(f"{_REASONS[1]}{self._instance.said()}")
-        if self._step(*self._step_arguments) > 1:
+        status = self._step(*self._step_arguments)
+        if status > 1:
+            if status == DISCARD and self._instance.ended():
+                raise FmuEndedError(ENDED)
             raise FmuError(f"{_REASONS[2]}{self._instance.said()}")
         if self._ended is not None and (self._ended[0].value or self._ended[1].value):
-            raise FmuError(_REASONS[5])
+            raise FmuEndedError(ENDED) if self._ended[0].value else FmuError(_REASONS[7])
         if self._get is not None:
             if self._get(*self._get_arguments) > 1:
                 raise FmuError(f"{_REASONS[3]}{self._instance.said()}")
@@ -224,8 +241,7 @@ class Fleet:
             try:
                 self._start_one(row, messages)
             except FmuError as error:
-                self._failed[row] = _STEP
-                failures[row] = str(error)
+                self._note(row, error, failures)
         self._active[:] = active
         self._live = self._find_live()
         self._prepare_calls()
@@ -343,8 +359,7 @@ class Fleet:
             try:
                 self._step_one(row, t, h)
             except FmuError as error:
-                self._failed[row] = _STEP
-                failures[row] = str(error)
+                self._note(row, error, failures)
         if failures:
             self._live = self._find_live()
         return failures
@@ -362,9 +377,19 @@ class Fleet:
                     if instance is not None and self._active[row]:
                         message.send(row, instance)
             except FmuError as error:
-                self._failed[row] = _STEP
-                failures[row] = str(error)
+                self._note(row, error, failures)
         return failures
+
+    def _note(self, row: int, error: FmuError, failures: Failures) -> None:
+        """Note why a member is not stepped any more; one that ended shows its last values."""
+        self._failed[row], failures[row] = _STEP, _said(error)
+        instance = self.instances[row]
+        if isinstance(error, FmuEndedError) and instance is not None:
+            self._failed[row] = _ENDED
+            try:
+                self._get_all(instance, row)
+            except FmuError as wrong:
+                self._failed[row], failures[row] = _STEP, str(wrong)
 
     def _step_one(self, row: int, t: float, h: float) -> None:
         if quick := self._quick.get(row):
@@ -398,6 +423,9 @@ class Fleet:
             instance = self.instances[row]
             assert instance is not None
             self._active[row] = 0
+            if code == _ENDED or (code == _DISCARDED and instance.ended()):
+                self._note(row, FmuEndedError(ENDED), found)
+                continue
             what = "an output is not finite" if code == _NOT_FINITE else (
                 f"fmi{self.library.version}{_REASONS[code]}{instance.said()}"
             )  # fmt: skip
@@ -447,7 +475,7 @@ class Fleet:
                 continue
             self.instances[row] = None
             try:
-                if not self._failed[row]:
+                if self._failed[row] in (0, _ENDED):
                     instance.terminate()
             except FmuError:
                 pass  # it is freed all the same

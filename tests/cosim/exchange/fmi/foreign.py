@@ -286,3 +286,99 @@ def strict(path, *, n_states, ends=False, stuck=False):
     defines = f"#define NX {n_states}\n#define ENDS {int(ends)}\n#define STUCK {int(stuck)}\n"
     xml = STRICT_XML.replace("STATES", states)
     return make_fmu(path, STRICT, xml, fmi=2, defines=defines)
+
+
+# ------------------------------------------------------------------ co-simulation that ends itself
+
+ENDING2 = """
+struct m { double stop, t; };
+static struct m *of(void *c) { return c; }
+F void *fmi2Instantiate(const char *a, int b, const char *c, const char *d, const void *e, int f,
+                        int g)
+{
+    return calloc(1, sizeof(struct m));
+}
+F void fmi2FreeInstance(void *c) { free(c); }
+F int fmi2SetupExperiment(void *c, int a, double b, double d, int e, double f) { return 0; }
+F int fmi2EnterInitializationMode(void *c) { return 0; }
+F int fmi2ExitInitializationMode(void *c) { return 0; }
+F int fmi2Terminate(void *c) { return 0; }
+F int fmi2DoStep(void *c, double t, double h, int b)
+{
+    struct m *i = c;
+    i->t = t + h < i->stop + 1e-9 ? t + h : i->stop;
+    return t + h < i->stop + 1e-9 ? 0 : 2;
+}
+F int fmi2GetBooleanStatus(void *c, int kind, int *v)
+{
+    *v = ENDS;
+    return kind == 3 ? 0 : 3;
+}
+F int fmi2SetReal(void *c, const uint32_t *vr, size_t n, const double *v)
+{
+    of(c)->stop = v[0];
+    return 0;
+}
+F int fmi2GetReal(void *c, const uint32_t *vr, size_t n, double *v) { v[0] = of(c)->t; return 0; }
+"""
+
+ENDING3 = """
+struct m { double stop, t; };
+static struct m *of(void *c) { return c; }
+F void *fmi3InstantiateCoSimulation(const char *a, const char *b, const char *c, bool d, bool e,
+    bool f, bool g, const uint32_t h[], size_t i, void *j, void *k, void *l)
+{
+    return calloc(1, sizeof(struct m));
+}
+F void fmi3FreeInstance(void *c) { free(c); }
+F int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool e, double f) { return 0; }
+F int fmi3ExitInitializationMode(void *c) { return 0; }
+F int fmi3Terminate(void *c) { return 0; }
+F int fmi3DoStep(void *c, double t, double h, bool a, bool *b, bool *end, bool *early, double *last)
+{
+    struct m *i = c;
+    *b = *early = false;
+    *end = t + h > i->stop + 1e-9;
+    *last = i->t = *end ? i->stop : t + h;
+    return 0;
+}
+F int fmi3SetFloat64(void *c, const uint32_t *vr, size_t n, const double *v, size_t m)
+{
+    of(c)->stop = v[0];
+    return 0;
+}
+F int fmi3GetFloat64(void *c, const uint32_t *vr, size_t n, double *v, size_t m)
+{
+    v[0] = of(c)->t;
+    return 0;
+}
+"""
+
+ENDING2_XML = """
+<CoSimulation modelIdentifier="m"/>
+<ModelVariables>
+  <ScalarVariable name="stop" valueReference="0" causality="parameter" variability="fixed">
+    <Real start="0"/></ScalarVariable>
+  <ScalarVariable name="y" valueReference="1" causality="output"><Real/></ScalarVariable>
+</ModelVariables>
+<ModelStructure><Outputs><Unknown index="2"/></Outputs></ModelStructure>
+"""
+
+ENDING3_XML = """
+<CoSimulation modelIdentifier="m"/>
+<ModelVariables>
+  <Float64 name="stop" valueReference="0" causality="parameter" start="0"/>
+  <Float64 name="y" valueReference="1" causality="output"/>
+</ModelVariables>
+<ModelStructure><Output valueReference="1"/></ModelStructure>
+"""
+
+
+def ending(path, *, fmi, ends=True):
+    """Write y = t that ends itself at its parameter `stop`, as FMI 2 or 3 has it.
+
+    Without `ends`, of FMI 2, the step is discarded for another reason.
+    """
+    defines = f"#define ENDS {int(ends)}\n"
+    source, xml = {2: (ENDING2, ENDING2_XML), 3: (ENDING3, ENDING3_XML)}[fmi]
+    return make_fmu(path, source, xml, fmi=fmi, defines=defines)
