@@ -327,7 +327,7 @@ class Fmu(Component):
         written = [(p.name, n, q) for p in self._outputs for n, (q, _) in p.fields.items()]
         written += [(p.name, "t", p.t) for p in self._outputs if p.t]
         written += [(p.name, "sequence", p.sequence) for p in self._outputs if p.sequence]
-        apart = interface.kind != CO_SIMULATION
+        apart = interface.kind != CO_SIMULATION or interface.event_mode
         inputs, self._input_at = grouped(read, discrete_apart=apart)
         outputs, self._output_at = grouped(written)
         setup = Setup(
@@ -339,6 +339,7 @@ class Fmu(Component):
             (*self._start_settings(), *self._identities()),
             self.given_parameters["solver"],
             float(self.given_parameters["tolerance"]),
+            interface.event_mode,
         )
         limit = float(self.given_parameters["time_limit"])
         self._fleet = (

@@ -84,6 +84,8 @@ class Setup:
         Values set before initialization.
     solver : str
     tolerance : float
+    event_mode : bool
+        Of co-simulation with FMI 3.
     """
 
     file: str
@@ -94,6 +96,7 @@ class Setup:
     starts: tuple[Start, ...] = ()
     solver: str = "cvode"
     tolerance: float = 1e-10
+    event_mode: bool = False
 
 
 @dataclass(frozen=True)
@@ -248,7 +251,9 @@ class Fleet:
         return failures
 
     def _start_one(self, row: int, messages: Sequence[Message]) -> None:
-        instance = self.instances[row] = Instance(self.library, f"{self.setup.name}_{row}")
+        name = f"{self.setup.name}_{row}"
+        instance = Instance(self.library, name, event_mode=self.setup.event_mode)
+        self.instances[row] = instance
         structural = [s for s in self.setup.starts if s.structural]
         if structural:
             instance.call("EnterConfigurationMode")
@@ -264,7 +269,7 @@ class Fleet:
             self._integrators[row] = Integrator(
                 instance, self.archive, 0.0, self.setup.solver, self.setup.tolerance
             )
-            self._last[row] = self.inputs[row, self._discrete]
+        self._last[row] = self.inputs[row, self._discrete]
         self._get_all(instance, row)
 
     def _set_starts(self, instance: Instance, row: int, starts: Sequence[Start]) -> None:
@@ -303,7 +308,7 @@ class Fleet:
         """
         groups = (self.setup.inputs, self.setup.outputs)
         real = all(len(g) <= 1 and all(x.kind in _DOUBLE for x in g) for g in groups)
-        if not real or self.setup.kind != CO_SIMULATION:
+        if not real or self.setup.kind != CO_SIMULATION or self.setup.event_mode:
             return
         self._quick = {
             row: _Quick(instance, self)
@@ -397,24 +402,21 @@ class Fleet:
             return
         instance = self.instances[row]
         assert instance is not None
-        if row in self._integrators:
-            self._advance(self._integrators[row], instance, row, t, h)
-        else:
+        now = self.inputs[row, self._discrete]
+        integrator = self._integrators.get(row)
+        if not len(now):
             self._set_all(instance, row)
+        elif np.array_equal(now, self._last.get(row, now)):
+            self._set_all(instance, row, discrete=(False,))
+        else:  # discrete inputs that changed are set in event mode
+            handle = instance.handle if integrator is None else integrator.handle
+            handle(t, lambda: self._set_all(instance, row))
+            self._last[row] = now
+        if integrator is not None:
+            integrator.advance(t, h)
+        else:
             instance.step(t, h)
         self._get_all(instance, row)
-
-    def _advance(
-        self, integrator: Integrator, instance: Instance, row: int, t: float, h: float
-    ) -> None:
-        """Integrate over a step; discrete inputs that changed are set in event mode."""
-        now = self.inputs[row, self._discrete]
-        if np.array_equal(now, self._last.get(row, now)):
-            self._set_all(instance, row, discrete=(False,))
-        else:
-            integrator.handle(t, lambda: self._set_all(instance, row))
-            self._last[row] = now
-        integrator.advance(t, h)
 
     def _explain(self) -> Failures:
         found: Failures = {}
@@ -447,6 +449,7 @@ class Fleet:
                 instance.deserialize(bytes(data))
                 if row in self._integrators:
                     self._integrators[row].restart()
+                if len(self._discrete):
                     self._last[row] = np.full(len(self._discrete), np.nan)  # they are set anew
 
     def mark(self) -> None:

@@ -150,6 +150,20 @@ class Interface:
     text_parameters: dict[str, Quantity] = field(default_factory=dict)
 
     @property
+    def event_mode(self) -> bool:
+        """Whether its co-simulation is to be run with event mode (FMI 3): it has it, and a use.
+
+        Discrete inputs are set and clocks tick there. Without them an FMU handles events itself.
+        """
+        interface = self.archive.description.coSimulation
+        if self.kind != CO_SIMULATION or not getattr(interface, "hasEventMode", False):
+            return False
+        return any(
+            v.type == "Clock" or (v.causality == "input" and v.variability == "discrete")
+            for v in self.archive.description.modelVariables
+        )
+
+    @property
     def said_of_parameters(self) -> list[Any]:
         """What the annotation says of parameters: frames, and which must be positive."""
         found = self.archive.annotation

@@ -12,12 +12,9 @@ import numpy as np
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.exchange.fmi.run.archive import Archive
-from terrafix.cosim.exchange.fmi.run.binding import FmuError, Instance
+from terrafix.cosim.exchange.fmi.run.binding import MOST_EVENTS, FmuError, Instance
 
 SOLVERS = ("cvode", "dop853")
-
-
-MOST_EVENTS = 1000  # handled at one time, before it is said that time stands still
 
 
 def _as_nominal(values: FloatArray) -> FloatArray:

@@ -382,3 +382,96 @@ def ending(path, *, fmi, ends=True):
     defines = f"#define ENDS {int(ends)}\n"
     source, xml = {2: (ENDING2, ENDING2_XML), 3: (ENDING3, ENDING3_XML)}[fmi]
     return make_fmu(path, source, xml, fmi=fmi, defines=defines)
+
+
+# ------------------------------------------------------------------ event mode, FMI 3 co-simulation
+
+STEPPING = """
+enum { START, INIT, EVENT, STEP };
+struct m { int mode, b, timed, own; double t, x, u, due, mine; };
+static struct m *of(void *c) { return c; }
+F void *fmi3InstantiateCoSimulation(const char *a, const char *b, const char *c, bool d, bool e,
+    bool events, bool early, const uint32_t h[], size_t i, void *j, void *k, void *l)
+{
+    struct m *made = events && early ? calloc(1, sizeof *made) : NULL;
+    if (made) made->due = 0.25, made->mine = 0.15;
+    return made;
+}
+F void fmi3FreeInstance(void *c) { free(c); }
+F int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool e, double f)
+{
+    of(c)->mode = INIT;
+    return 0;
+}
+F int fmi3ExitInitializationMode(void *c) { of(c)->mode = EVENT; return 0; }
+F int fmi3Terminate(void *c) { return 0; }
+F int fmi3EnterEventMode(void *c)
+{
+    if (of(c)->mode != STEP) return 3;
+    of(c)->mode = EVENT;
+    return 0;
+}
+F int fmi3EnterStepMode(void *c)
+{
+    if (of(c)->mode != EVENT) return 3;
+    of(c)->mode = STEP;
+    return 0;
+}
+F int fmi3UpdateDiscreteStates(void *c, bool *again, bool *end, bool *nominals, bool *states,
+                               bool *defined, double *next)
+{
+    struct m *i = c;
+    if (i->mode != EVENT) return 3;
+    *again = *end = *nominals = *states = false;
+    if (i->t >= i->due - 1e-9) i->timed++, i->due += 0.25;
+    if (i->t >= i->mine - 1e-9) i->own++, i->mine += 0.15;
+    *defined = true;
+    *next = i->due;
+    return 0;
+}
+F int fmi3DoStep(void *c, double t, double h, bool a, bool *event, bool *end, bool *early,
+                 double *last)
+{
+    struct m *i = c;
+    double stop = t + h;
+    if (i->mode != STEP || stop > i->due + 1e-9) return 3; /* it asked to stop there */
+    *early = i->mine < stop - 1e-9;
+    stop = *early ? i->mine : stop;
+    *event = i->mine < stop + 1e-9;
+    *end = false;
+    i->x += (stop - t) * i->u;
+    *last = i->t = stop;
+    return 0;
+}
+static int settable(struct m *i) { return i->mode == INIT || i->mode == EVENT ? 0 : 3; }
+F int fmi3SetFloat64(void *c, const uint32_t *vr, size_t n, const double *v, size_t m)
+{
+    of(c)->u = v[0];
+    return settable(c);
+}
+F int fmi3SetBoolean(void *c, const uint32_t *vr, size_t n, const bool *v, size_t m)
+{
+    of(c)->b = v[0];
+    return settable(c);
+}
+F int fmi3GetFloat64(void *c, const uint32_t *vr, size_t n, double *v, size_t m)
+{
+    v[0] = of(c)->x, v[1] = of(c)->timed, v[2] = of(c)->own;
+    return 0;
+}
+"""
+
+STEPPING_XML = """
+<CoSimulation modelIdentifier="m" hasEventMode="true"/>
+<ModelVariables>
+  <Float64 name="u" valueReference="0" causality="input" variability="discrete" start="0"/>
+  <Boolean name="b" valueReference="1" causality="input" start="false"/>
+  <Float64 name="y" valueReference="2" causality="output"><Dimension start="3"/></Float64>
+</ModelVariables>
+<ModelStructure><Output valueReference="2"/></ModelStructure>
+"""
+
+
+def stepping(path):
+    """Write a co-simulation that runs with event mode alone, and refuses what a mode forbids."""
+    return make_fmu(path, STEPPING, STEPPING_XML, fmi=3)

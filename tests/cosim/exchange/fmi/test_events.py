@@ -73,6 +73,22 @@ def test_an_fmu_that_asks_for_an_event_again_and_again(tmp_path):
         simulate(driven(file), duration="1")
 
 
+# ------------------------------------------------------------------ co-simulation with FMI 3
+
+
+def test_event_mode_of_co_simulation(tmp_path):
+    """The FMU refuses discrete inputs outside of event mode, and steps over its own events.
+
+    y = (integral of u, number of time events every 0.25 s, number of its own events at every
+    0.15 s, where it returns early): at t = 1 s 4.5, 4 and 6.
+    """
+    file = foreign.stepping(tmp_path / "stepping.fmu")
+    y = simulate(driven(file), duration="1").dataset["part.y"].values[:, 0]
+    assert y[-1] == pytest.approx([4.5, 4.0, 6.0], abs=1e-12)
+    assert y[:, 1].tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4]
+    assert y[:, 2].tolist() == [0, 0, 1, 2, 2, 3, 4, 4, 5, 6, 6]
+
+
 # ------------------------------------------------------------------ an FMU that ends its simulation
 
 
