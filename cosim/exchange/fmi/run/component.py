@@ -174,8 +174,12 @@ class Fmu(Component):
         notes: tuple[str, ...] = ()
         if not found.serialize:
             notes = ("its state cannot be saved: no checkpoints",)
-        if found.left_out:
-            notes += (f"{', '.join(found.left_out)} cannot be connected: no numbers",)
+        clocks = found.input_clocks
+        left_out = [name for name in found.left_out if name not in clocks]
+        if left_out:
+            notes += (f"{', '.join(left_out)} cannot be connected: no numbers",)
+        if clocks:
+            notes += (f"its clocks {', '.join(clocks)} never tick: terrafix drives no clocks",)
         self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
 
     def _take_parameters_of_start(self) -> None:

@@ -164,6 +164,12 @@ class Interface:
         )
 
     @property
+    def input_clocks(self) -> list[str]:
+        """Clocks that its environment should let tick."""
+        variables = self.archive.description.modelVariables
+        return [v.name for v in variables if v.type == "Clock" and v.causality == "input"]
+
+    @property
     def said_of_parameters(self) -> list[Any]:
         """What the annotation says of parameters: frames, and which must be positive."""
         found = self.archive.annotation

@@ -89,6 +89,16 @@ def test_event_mode_of_co_simulation(tmp_path):
     assert y[:, 2].tolist() == [0, 0, 1, 2, 2, 3, 4, 4, 5, 6, 6]
 
 
+def test_clocks_that_never_tick_are_told(tmp_path):
+    clock = '<Clock name="c" valueReference="9" causality="input" intervalVariability="triggered"/>'
+    xml = foreign.STEPPING_XML.replace("</ModelVariables>", f"{clock}</ModelVariables>")
+    file = foreign.make_fmu(tmp_path / "clock.fmu", foreign.STEPPING, xml, fmi=3)
+    assert (
+        driven(file).check().notes[1]
+        == "'part': its clocks c never tick: terrafix drives no clocks"
+    )
+
+
 # ------------------------------------------------------------------ an FMU that ends its simulation
 
 
