@@ -141,11 +141,6 @@ class Fmu(Component):
         if isinstance(self._found_settings.get(name), Size):
             self.declare_settings()  # arrays have another size
 
-    def __getattr__(self, name: str) -> Any:
-        if name in self.__dict__.get("_found_settings", ()):
-            return self.parameter_values.get(name, self.setting(name))
-        raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
-
     def prepare(self) -> None:
         """Read the file, and declare its parameters and ports."""
         self.declare_settings()

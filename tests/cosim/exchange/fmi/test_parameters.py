@@ -98,7 +98,7 @@ def test_a_parameter_is_declared_with_unit_bounds_and_meaning(settings):
     assert (body.kind(), body.doc, float(body.default)) == ("number [kg]", "mass of the body", 2.0)
     assert fmu.settings()["mode"].kind() == '"off" | "slow" | "fast"'
     assert fmu.is_default("body_k")
-    assert float(fmu.body_k) == 2.0
+    assert float(fmu.setting("body_k")) == 2.0
     for value, message in (
         ("0.5 kg", r"'part.body_k' is 0.5 kg; it must be at least 1 kg, says its FMU"),
         ("25000 g", r"is 25 kg; it must be at most 20 kg"),
