@@ -88,6 +88,19 @@ def docstring(kind: type) -> str:
     return inspect.cleandoc(getattr(found, "written", found) or "")
 
 
+class _Settings:
+    """``settings()``, of a type or of a component: its declared parameters by name.
+
+    Those of a component are also what `declare_settings` found (the parameters of an FMU).
+    """
+
+    def __get__(
+        self, obj: Component | None, owner: type[Component]
+    ) -> Callable[[], dict[str, Setting[object]]]:
+        declared = {n: d for n, d in owner.declarations.items() if isinstance(d, Setting)}
+        return lambda: declared if obj is None else declared | obj._found_settings
+
+
 class _CallTip:
     """Signature of a component type: its parameters are keyword arguments."""
 
@@ -126,6 +139,8 @@ class Environment:
         ``fail(mask, reason)`` excludes members from here on.
     quiet : bool
         Every draw of noise is zero: the nominal run, about which errors are linearized.
+    end : callable, optional
+        ``end(mask, reason)`` ends the runs of members when this tick is over, which is no failure.
     """
 
     path: str
@@ -134,6 +149,7 @@ class Environment:
     active: Mask
     fail: Callable[[Mask, str], None]
     quiet: bool = False
+    end: Callable[[Mask, str], None] | None = None
 
     @property
     def n_members(self) -> int:
@@ -208,6 +224,7 @@ class Component(Shown):
         self.state_arrays: dict[str, NDArray[Any]] = {}
         self.parameter_values: dict[str, Any] = {}
         self.given_parameters: dict[str, Any] = {}
+        self._found_settings: dict[str, Setting[object]] = {}
         self._environment: Environment | None = None
         self._streams: dict[tuple[str, int], NormalBlocks] = {}
         self.step_index = 0
@@ -216,12 +233,9 @@ class Component(Shown):
         for name, value in self.declarations.items():
             if isinstance(value, Port):
                 self.ports[name] = value
-        for name in settings:
-            if name not in declared:
-                raise ConfigurationError(
-                    f"{type(self).__name__} has no parameter '{name}'\n"
-                    f"  {nearest(name, declared, what='its parameters')}"
-                )
+        later = [n for n in settings if n not in declared]
+        if later and not self.declares_settings():
+            raise self._unknown_parameter(later[0])
         for name, setting in declared.items():
             if name in settings:
                 self.set_parameter(name, settings[name])
@@ -229,13 +243,34 @@ class Component(Shown):
                 self.parameter_values[name] = self.given_parameters[name] = setting.read(
                     setting.default, where=f"default of '{name}'"
                 )
+        if later:
+            self.declare_settings()
+        for name in self.in_order_of_setting(later):
+            self.set_parameter(name, settings[name])
 
     # ------------------------------------------------------------------ settings and ports
 
+    settings = _Settings()
+
+    def declare_settings(self) -> None:
+        """Find the parameters that depend on others (an FMU's, on its file), once these are set."""
+
     @classmethod
-    def settings(cls) -> dict[str, Setting[object]]:
-        """Declared parameters by name."""
-        return {n: d for n, d in cls.declarations.items() if isinstance(d, Setting)}
+    def declares_settings(cls) -> bool:
+        """Whether it has parameters besides those of its type."""
+        return cls.declare_settings is not Component.declare_settings
+
+    def in_order_of_setting(self, names: Iterable[str]) -> list[str]:
+        """Names of parameters, those first that decide the structure, and so what others take."""
+        settings = self.settings()
+        return sorted(names, key=lambda name: isinstance(settings.get(name), Parameter))
+
+    def _unknown_parameter(self, name: str) -> ConfigurationError:
+        known = self.settings()
+        return ConfigurationError(
+            f"{type(self).__name__} has no parameter '{name}'\n"
+            f"  {nearest(name, known, what='its parameters')}"
+        )
 
     def set_parameter(self, name: str, value: object, *, bare: bool = True) -> None:
         """Set a parameter by name, as assigning it does; `bare` allows numbers without a unit."""
@@ -244,12 +279,18 @@ class Component(Shown):
                 f"'{self.name}.{name}' cannot be set while a simulation runs; set it before"
             )
         where = f"'{self.name}.{name}'" if self.name else f"{type(self).__name__} '{name}'"
-        self.parameter_values[name] = self.given_parameters[name] = self.settings()[name].read(
+        setting = self.settings().get(name)
+        if setting is None:
+            raise self._unknown_parameter(name)
+        self.parameter_values[name] = self.given_parameters[name] = setting.read(
             value, where=where, bare=bare
         )
 
     def setting(self, name: str) -> Any:
         """The value that was set (for numeric parameters: before dispersions, without members)."""
+        if name in self._found_settings and name not in self.given_parameters:
+            declared = self._found_settings[name]
+            return None if declared.required else declared.default
         return self.given_parameters[name]
 
     def is_default(self, name: str) -> bool:
@@ -278,9 +319,8 @@ class Component(Shown):
 
     def missing_settings(self) -> list[str]:
         """Names of required parameters that were not given."""
-        return [
-            n for n, s in self.settings().items() if s.required and n not in self.given_parameters
-        ]
+        declared = type(self).settings()
+        return [n for n, s in declared.items() if s.required and n not in self.given_parameters]
 
     def __getitem__(self, port: str) -> PortRef:
         """Name a port: ``imu["delta_v"]``.
@@ -338,8 +378,10 @@ class Component(Shown):
                 field = declared.field
                 self.state_arrays[name] = np.empty((n, *field.fixed_shape), dtype=field.dtype)
                 self.state_arrays[name][...] = declared.start
-            elif isinstance(declared, Parameter) and name in self.given_parameters:
-                base = np.asarray(self.given_parameters[name], dtype=np.float64)
+        for name, setting in self.settings().items():
+            found = name in self._found_settings and not setting.required
+            if isinstance(setting, Parameter) and (found or name in self.given_parameters):
+                base = np.asarray(self.setting(name), dtype=np.float64)
                 self.parameter_values[name] = np.broadcast_to(base, (n, *base.shape)).copy()
 
     def release(self) -> None:
@@ -437,6 +479,11 @@ class Component(Shown):
     def fail(self, mask: ArrayLike, reason: str) -> None:
         """Exclude the members in `mask` (n_members,) from here on, with a reason."""
         self.environment.fail(np.asarray(mask, dtype=np.bool_), reason)
+
+    def end_run(self, mask: ArrayLike, reason: str) -> None:
+        """End the runs of the members in `mask` (n_members,) after this tick: they are complete."""
+        end = self.environment.end or self.environment.fail
+        end(np.asarray(mask, dtype=np.bool_), reason)
 
     def get_state(self) -> dict[str, Any]:
         """Arrays and plain values that reproduce this component."""

@@ -145,9 +145,9 @@ def _and_more(count: int) -> list[Block]:
 
 
 def _value(name: str, setting: Setting[object], values: Mapping[str, Any]) -> str:
-    if name not in values:
+    if name not in values and setting.required:
         return "missing"
-    value = values[name]
+    value = values.get(name, setting.default)
     if not isinstance(setting, Parameter):
         return str(value) if isinstance(value, str) else written(setting.write(value))
     array = np.asarray(value, dtype=np.float64)

@@ -69,6 +69,7 @@ def bind_components(
     active: NDArray[np.bool_],
     fail: Callable[[str, NDArray[np.bool_], str], None],
     quiet: bool = False,
+    end: Callable[[str, NDArray[np.bool_], str], None] | None = None,
 ) -> None:
     """Lend every component its environment and arrays."""
     for path, component in plan.flat.components.items():
@@ -76,7 +77,10 @@ def bind_components(
         def report(mask: NDArray[np.bool_], reason: str, path: str = path) -> None:
             fail(path, mask, reason)
 
-        component.bind(Environment(path, seed, members, active, report, quiet))
+        def finish(mask: NDArray[np.bool_], reason: str, path: str = path) -> None:
+            (end or fail)(path, mask, reason)
+
+        component.bind(Environment(path, seed, members, active, report, quiet, finish))
 
 
 def connect_ports(plan: Plan, n_members: int, active: NDArray[np.bool_]) -> Wiring:

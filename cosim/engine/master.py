@@ -70,11 +70,19 @@ class Master:
         self.members = members
         self.active: Mask = np.ones(len(members), dtype=np.bool_)
         self.excluded: list[dict[str, Any]] = []
+        self.ended: list[dict[str, Any]] = []
+        self._ending: list[tuple[str, Mask, str]] = []
         self.tick = 0
         self.component_steps = 0
         self._numerator, self._denominator = plan.base.numerator, plan.base.denominator
         bind_components(
-            plan, seed=seed, members=members, active=self.active, fail=self._exclude, quiet=quiet
+            plan,
+            seed=seed,
+            members=members,
+            active=self.active,
+            fail=self._exclude,
+            quiet=quiet,
+            end=lambda *ending: self._ending.append(ending),
         )
         self._lent = {p: c.environment for p, c in plan.flat.components.items()}
         self._terminated = False
@@ -119,6 +127,19 @@ class Master:
         ]
         self.active &= ~newly
 
+    def _end_members(self) -> None:
+        """Stop members whose runs a component ended in this tick, which is observed."""
+        t = self.seconds(self.tick)
+        for path, mask, reason in self._ending:
+            newly = mask & self.active
+            self.ended += [
+                {"member": int(m), "component": path, "t_s": t, "reason": reason}
+                for m in self.members[newly]
+            ]
+            self.active &= ~newly
+        self._ending.clear()
+        self._check_members()
+
     # ------------------------------------------------------------------ running
 
     def initialize(self, *, observe: bool = True) -> None:
@@ -147,6 +168,8 @@ class Master:
             if observe and group.sample is not None and group.rate.starts_at_zero:
                 group.sample(0.0)
         self.agenda.move_to(0)
+        if self._ending:
+            self._end_members()
 
     def _program(self, due: tuple[int, ...]) -> Program:
         groups = self.agenda.groups
@@ -243,6 +266,8 @@ class Master:
                 if len(self.excluded) != n_excluded:
                     n_excluded = len(self.excluded)
                     self._check_members()
+                if self._ending:
+                    self._end_members()
         except Exception as error:
             if entry is None and isinstance(error, StepError):  # no member is left
                 raise
@@ -256,6 +281,8 @@ class Master:
 
     def _check_members(self) -> None:
         if not self.active.any():
+            if self.ended:
+                raise EverybodyEndedError("the runs of all members have ended")
             last = self.excluded[-1]
             raise StepError(nobody_left(last, f"{last['t_s']:.9g} s (tick {self.tick})"))
 
@@ -298,6 +325,7 @@ class Master:
             "component_steps": self.component_steps,
             "active": self.active.copy(),
             "excluded": [dict(e) for e in self.excluded],
+            "ended": [dict(e) for e in self.ended],
             "components": {p: e.component.get_state() for p, e in self.entries.items()},
             "links": {name: k.get_state() for name, k in self.wiring.keepers.items()},
         }
@@ -308,11 +336,16 @@ class Master:
         self.component_steps = int(saved["component_steps"])
         self.active[:] = saved["active"]
         self.excluded[:] = [dict(e) for e in saved["excluded"]]
+        self.ended[:] = [dict(e) for e in saved.get("ended", ())]
         for path, state in saved["components"].items():
             self.entries[path].component.set_state(state)
         for name, state in saved["links"].items():
             self.wiring.keepers[name].set_state(state)
         self.agenda.move_to(self.tick)
+
+
+class EverybodyEndedError(StepError):
+    """The run is complete before its time: components have ended the runs of all members."""
 
 
 def nobody_left(last: Mapping[str, Any], when: str) -> str:

@@ -27,7 +27,7 @@ from terrafix.cosim.basics.errors import (
 )
 from terrafix.cosim.engine.apart import fly_apart, fly_part
 from terrafix.cosim.engine.flight import Flight
-from terrafix.cosim.engine.master import nobody_left
+from terrafix.cosim.engine.master import EverybodyEndedError, nobody_left
 from terrafix.cosim.engine.result import Result
 from terrafix.cosim.engine.simulation import Progress, Simulation
 from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
@@ -168,6 +168,8 @@ def _run(
         else:
             simulation.initialize()
         _fly(simulation, length, every, places, progress)
+    except EverybodyEndedError:
+        return _finish(simulation, simulation.flight(), started, "complete", places)
     except (StepError, KeyboardInterrupt) as error:
         failure: BaseException | None = error
         flight = simulation.flight()

@@ -276,12 +276,23 @@ class Simulation:
             for path, slot in self.master.wiring.slots.items()
             if isinstance(slot, SignalSlot) and slot.never_written
         ]
-        remarks = [
+        notes = [
             f"'{path}': {remark}"
             for path, component in self.plan.flat.components.items()
             for remark in component.remarks
         ]
-        return remarks + [f"output '{path}' was never published" for path in silent]
+        notes += [f"output '{path}' was never published" for path in silent]
+        groups: dict[tuple[str, float, str], list[str]] = {}
+        for e in self.master.ended:
+            found = groups.setdefault((e["component"], e["t_s"], e["reason"]), [])
+            found.append(str(e["member"]))
+        for (path, t, reason), members in groups.items():
+            many = "s" if len(members) > 1 else ""
+            shown = ", ".join(members[:8]) + (", ..." if len(members) > 8 else "")
+            notes.append(
+                f"'{path}' ended the run of member{many} {shown} at t = {t:.9g} s: {reason}"
+            )
+        return notes
 
     def flight(self) -> Flight:
         """What was flown so far."""

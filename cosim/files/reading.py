@@ -236,16 +236,18 @@ def _component(
     made.doc = str(table.get("doc", ""))
     timing = {k: table[k] for k in TIMING if k in table}
     given = {k: v for k, v in table.items() if k not in (*TIMING, "type", "doc")}
-    refused = 0
-    for key, value in given.items():
-        refused += not _set(load, made, key, value, from_file=True)
-    for key, value, from_file in values:
+    for key, value, _ in values:
         if key in TIMING:
             if key != "offset":
                 timing = {k: v for k, v in timing.items() if k == "offset" and key != "times"}
             timing[key] = value
-        else:
-            refused += not _set(load, made, key, value, from_file=from_file)
+    settable = [(k, v, True) for k, v in given.items()]
+    settable += [each for each in values if each[0] not in TIMING]
+    early = type(made).settings()
+    later = [e for e in settable if e[0] not in early] if made.declares_settings() else []
+    settable = [e for e in settable if e[0] in early] if later else settable
+    refused = sum(not _set(load, made, *each) for each in settable)
+    refused += _set_later(load, made, later, lost=bool(refused or made.missing_settings()))
     for key in made.missing_settings():
         if f"{name}.{key}" in load.withheld:
             made.given_parameters[key] = None
@@ -265,7 +267,21 @@ def _component(
         load.broken.add(name)  # its ports depend on its parameters
 
 
-def _set(load: Load, component: Component, key: str, value: Any, *, from_file: bool) -> bool:
+def _set_later(load: Load, component: Component, later: list[Value], *, lost: bool) -> int:
+    """Set parameters that depend on others, if these could be set; how many were refused."""
+    if not later:
+        return 0
+    before = len(load.problems)
+    if not lost:
+        load.attempt(component.declare_settings)
+    if lost or len(load.problems) > before:
+        return len(later)
+    keys = component.in_order_of_setting(dict.fromkeys(key for key, _, _ in later))
+    later = sorted(later, key=lambda each: keys.index(each[0]))
+    return sum(not _set(load, component, *each) for each in later)
+
+
+def _set(load: Load, component: Component, key: str, value: Any, from_file: bool) -> bool:
     """Set a parameter; False if it was refused, which is noted, and not again as missing."""
     settings = component.settings()
     if key not in settings:

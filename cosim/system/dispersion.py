@@ -145,6 +145,12 @@ class Dispersion:
                     f"dispersion '{self.name}' feeds '{target}'\n  {reason}\n"
                     "  choose otherwise, or leave it out"
                 )
+            absent = setting.required and name not in component.given_parameters
+            if absent and name not in component.missing_settings():
+                raise ConfigurationError(
+                    f"dispersion '{self.name}' feeds '{target}', which has no value to begin with\n"
+                    f"  give it one: {name} = ..."
+                )
             return setting
         state = component.declarations.get(name)
         if isinstance(state, State) and np.dtype(state.field.dtype) == np.float64:

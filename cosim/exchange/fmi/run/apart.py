@@ -24,7 +24,7 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import TerrafixError
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import callbacks_of_fmi2
-from terrafix.cosim.exchange.fmi.run.fleet import Failures, Fleet, Message, Setup
+from terrafix.cosim.exchange.fmi.run.fleet import Ended, Failures, Fleet, Message, Setup
 from terrafix.cosim.exchange.fmi.run.reading import REAL
 from terrafix.cosim.exchange.fmi.run.remote import (
     answer_requests,
@@ -169,7 +169,11 @@ class FleetApart:
             self._log += [(row, status, text) for _, status, text in log]
             if own:
                 failures[row] = own[0]
-        for row in failures:
+        for row, said in failures.items():
+            if isinstance(said, Ended) and row in self._forks:
+                self._forks[row].ask("close")
+                with suppress(TerrafixError):
+                    self._forks[row].answer(self._limit)
             self._end(row)
         return failures
 
@@ -241,8 +245,7 @@ def _one_member(setup: Setup) -> dict[str, Any]:
 
 def _of_one(setup: Setup, row: int) -> Setup:
     """The setup of a member alone."""
-    each = tuple((kind, vr, (values[row],)) for kind, vr, values in setup.each)
-    return replace(setup, name=f"{setup.name}_{row}", each=each)
+    return replace(setup.of([row]), name=f"{setup.name}_{row}")
 
 
 def _for_one(messages: Sequence[Message], row: int) -> list[Message]:
@@ -346,8 +349,7 @@ def _play(
     seen = []
     for rows in casts:
         chosen = list(rows)
-        each = tuple((kind, vr, tuple(v[r] for r in rows)) for kind, vr, v in setup.each)
-        fleet = Fleet(replace(setup, each=each), len(rows))
+        fleet = Fleet(setup.of(chosen), len(rows))
         fleet.inputs[...] = inputs[chosen]
         failures = fleet.start(np.ones(len(rows), np.bool_))
         found = [fleet.outputs.copy()]

@@ -188,6 +188,15 @@ def _check_identifier(identifier: str, tag: str, file: Path) -> None:
         )
 
 
+def _bound_unsigned(root: Any, description: Any) -> None:
+    """Read the bounds of unsigned integers, which FMPy leaves out."""
+    variables = {v.name: v for v in description.modelVariables if v.type.startswith("UInt")}
+    for element in root.iter() if variables else ():
+        if element.tag.startswith("UInt") and element.get("name") in variables:
+            variable = variables[element.get("name")]
+            variable.min, variable.max = element.get("min"), element.get("max")
+
+
 def _read(file: Path, folder: Path) -> Archive:
     from xml.etree import ElementTree as ET
 
@@ -219,6 +228,7 @@ def _read(file: Path, folder: Path) -> Archive:
     for tag in ("CoSimulation", "ModelExchange", "ScheduledExecution"):
         for each in root.iter(tag):
             _check_identifier(each.get("modelIdentifier", ""), tag, file)
+    _bound_unsigned(root, description)
     directional = any(
         each.get(name) in ("true", "1")
         for tag in ("CoSimulation", "ModelExchange")

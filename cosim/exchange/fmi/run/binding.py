@@ -11,7 +11,7 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,10 @@ from terrafix.cosim.exchange.fmi.run.archive import Archive
 from terrafix.cosim.exchange.fmi.run.whole import limits
 
 CO_SIMULATION, MODEL_EXCHANGE = "co-simulation", "model exchange"
+MOST_EVENTS = 1000  # handled at one time, before it is said that time stands still
+ENDED = "the FMU asks to end the simulation"
+DISCARD = 2
+_TERMINATED = 3  # of fmi2StatusKind
 STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 _TYPES: dict[str, tuple[str, Any]] = {  # of the variable: (in function names, of ctypes)
     "Real": ("Real", ct.c_double),
@@ -60,6 +64,10 @@ class FmuError(TerrafixError):
     def __init__(self, text: str, status: int = 3) -> None:
         super().__init__(text)
         self.status = status
+
+
+class FmuEndedError(FmuError):
+    """An FMU that ended its simulation, as it may."""
 
 
 class _Environment(ct.Array[ct.c_longlong]):
@@ -255,8 +263,10 @@ class Instance:
 
     _next = 1
 
-    def __init__(self, library: Library, name: str) -> None:
+    def __init__(self, library: Library, name: str, *, event_mode: bool = False) -> None:
         self.library = library
+        self._event_mode = event_mode
+        self._next_event: float | None = None
         self._version = library.version
         self._environment = self.environment = Instance._next
         Instance._next += 1
@@ -284,7 +294,8 @@ class Instance:
             arguments = [name.encode(), token.encode(), where.encode(), ct.c_bool(False)]
             arguments.append(ct.c_bool(True))
             if co_simulation:
-                arguments += [ct.c_bool(False), ct.c_bool(False), None, ct.c_size_t(0)]
+                arguments += [ct.c_bool(event_mode), ct.c_bool(event_mode)]  # and early return
+                arguments += [None, ct.c_size_t(0)]
             arguments += [ct.c_void_p(self._environment), _log3]
             arguments += [None] if co_simulation else []
         function.restype = ct.c_void_p
@@ -330,6 +341,20 @@ class Instance:
     def finish(self) -> None:
         """Leave initialization mode."""
         self.call("ExitInitializationMode")
+        if self._event_mode:
+            self._update()
+
+    def _update(self) -> None:
+        _, self._next_event = self.discrete_update()
+        self.call("EnterStepMode")
+
+    def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
+        """Handle events of co-simulation (FMI 3), and what `change` sets in event mode."""
+        del t  # the FMU knows it
+        self.call("EnterEventMode")
+        if change is not None:
+            change()
+        self._update()
 
     def reset(self) -> None:
         """Return to the state after instantiation."""
@@ -412,21 +437,67 @@ class Instance:
             place -= size
         return "a variable"
 
+    def set_texts(self, vr: Any, texts: Sequence[str]) -> None:
+        """Set variables of text."""
+        array = (ct.c_char_p * max(len(texts), 1))(*(text.encode() for text in texts))
+        sizes = () if self._version == 2 else (ct.c_size_t(len(texts)),)
+        self.call("SetString", vr, ct.c_size_t(len(vr)), array, *sizes)
+
     # ------------------------------------------------------------------ co-simulation
 
     def step(self, t: float, h: float) -> None:
         """Advance from `t` by `h` [s]."""
         if self._version == 2:
-            self.call("DoStep", ct.c_double(t), ct.c_double(h), 1)
+            try:
+                self.call("DoStep", ct.c_double(t), ct.c_double(h), 1)
+            except FmuError as error:
+                if error.status == DISCARD and self.ended():
+                    raise FmuEndedError(ENDED) from error
+                raise
             return
+        if self._event_mode:
+            self._step_with_events(t, t + h)
+            return
+        _, early, last = self._step3(t, h)
+        if early and last < t + h:
+            raise FmuError(f"the FMU returned early, at t = {last:.9g} s")
+
+    def _step3(self, t: float, h: float) -> tuple[bool, bool, float]:
+        """Step as FMI 3 has it; whether there is an event, it returned early, and when."""
         flags = [ct.c_bool() for _ in range(3)]
         last = ct.c_double()
         self.call("DoStep", ct.c_double(t), ct.c_double(h), ct.c_bool(True),
                   *(ct.byref(f) for f in flags), ct.byref(last))  # fmt: skip
         if flags[1].value:
-            raise FmuError(f"the FMU asks to end the simulation at t = {last.value:.9g} s")
-        if flags[2].value and last.value < t + h:
-            raise FmuError(f"the FMU returned early, at t = {last.value:.9g} s")
+            raise FmuEndedError(f"the FMU asks to end the simulation at t = {last.value:.9g} s")
+        return bool(flags[0].value), bool(flags[2].value), float(last.value)
+
+    def _step_with_events(self, t: float, end: float) -> None:
+        """Step to a time, stopping at events: where the FMU returns, and where it asked to."""
+        tolerance, standing = 1e-9 * (end - t), 0
+        while end - t > tolerance:
+            due = self._next_event
+            stop = end if due is None or due > end - tolerance else max(due, t)
+            begun, event = t, False
+            if stop > t:
+                event, early, last = self._step3(t, stop - t)
+                t = last if early and last < stop else stop
+            if event or (due is not None and t >= due - tolerance):
+                self.handle(t)
+            standing = 0 if t > begun else standing + 1
+            if standing > MOST_EVENTS:
+                raise FmuError(f"it asks for event after event at t = {t:.9g} s: time stands still")
+
+    def ended(self) -> bool:
+        """Whether it ended its simulation with the step that it discarded (FMI 2)."""
+        if self._version != 2 or not self.library.has("GetBooleanStatus"):
+            return False
+        value = ct.c_int()
+        try:
+            self.call("GetBooleanStatus", _TERMINATED, ct.byref(value))
+        except FmuError:
+            return False
+        return bool(value.value)
 
     # ------------------------------------------------------------------ state
 
@@ -509,7 +580,7 @@ class Instance:
                 changed |= bool(flags[3].value)
                 defined, time = flags[4].value, next_time.value
             if end:
-                raise FmuError("the FMU asks to end the simulation")
+                raise FmuEndedError(ENDED)
             if not again:
                 return changed, (float(time) if defined else None)
         raise FmuError("discrete states did not settle in 1000 updates")
@@ -525,7 +596,7 @@ class Instance:
         true = 1 if self._version == 2 else ct.c_bool(True)
         self.call("CompletedIntegratorStep", true, ct.byref(event), ct.byref(end))
         if end.value:
-            raise FmuError("the FMU asks to end the simulation")
+            raise FmuEndedError(ENDED)
         return bool(event.value)
 
     def get_vector(self, name: str, n: int) -> FloatArray:

@@ -15,8 +15,15 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import UNDEFINED
-from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.parameters import Choice, FilePath, Flag, Parameter, Table
+from terrafix.cosim.declare.component import ATTRIBUTES, KEYS, Component
+from terrafix.cosim.declare.parameters import (
+    Choice,
+    FilePath,
+    Flag,
+    Parameter,
+    Setting,
+    Table,
+)
 from terrafix.cosim.declare.ports import (
     BundleInput,
     BundleOutput,
@@ -29,9 +36,19 @@ from terrafix.cosim.declare.ports import (
 )
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE, STATUS
-from terrafix.cosim.exchange.fmi.run.fleet import Failures, Group, Message, Setup
+from terrafix.cosim.exchange.fmi.run.fleet import Ended, Failures, Group, Message, Setup
+from terrafix.cosim.exchange.fmi.run.parameters import (
+    EXACT,
+    STRUCTURAL,
+    Size,
+    Start,
+    declared_setting,
+    setting_names,
+    start_values,
+)
 from terrafix.cosim.exchange.fmi.run.places import AnyFleet, make_fleet
 from terrafix.cosim.exchange.fmi.run.reading import (
+    REAL,
     ImportedPort,
     Interface,
     Quantity,
@@ -52,9 +69,10 @@ MOST_LOGGED = 20
 class Fmu(Component):
     """A Functional Mock-up Unit, FMI 2 or 3, one instance for each member.
 
-    Ports, units, arrays and start values are those of its model description. Inputs of an FMU that
-    does not say otherwise are read at the start of a step: they hold what was published at the time
-    the step begins, as masters of co-simulation have it.
+    Ports, units, arrays and start values are those of its model description, and so are parameters,
+    which are set by name like any other. Inputs of an FMU that does not say otherwise are read at
+    the start of a step: they hold what was published at the time the step begins, as masters of
+    co-simulation have it.
     """
 
     file = FilePath(doc="the .fmu file")
@@ -68,7 +86,7 @@ class Fmu(Component):
         False, doc="inputs read at the start keep their start values through the first step"
     )
     arrays = Flag(True, doc="elements r[1], r[2], ... of FMI 2 form an array port")
-    start = Table(doc="parameters and start values of inputs by name, with units")
+    start = Table(doc="start values of inputs, also parameters, by the FMU's names, with units")
     units = Table(doc="units of ports by name, where the FMU does not say")
     frames = Table(doc="frames of ports by name, where the FMU does not say")
     observe = Table(doc='local variables and parameters that outputs show: { height = "body.h" }')
@@ -85,6 +103,9 @@ class Fmu(Component):
     )
 
     _interface: Interface | None = None
+    _found: tuple[Any, Interface] | None = None
+    _from_start: frozenset[str] = frozenset()
+    _quantities: dict[str, Quantity]
     _fleet: AnyFleet | None = None
 
     # ------------------------------------------------------------------ declaration
@@ -96,12 +117,57 @@ class Fmu(Component):
             raise ConfigurationError("set the file of the FMU first")
         return self._interface
 
-    def prepare(self) -> None:
-        """Read the file, and declare its ports."""
+    def declare_settings(self) -> None:
+        """Declare the parameters of the FMU."""
         archive = open_archive(self.given_parameters["file"])
-        self._interface = found = read_interface(
-            archive, self.given_parameters["kind"], arrays=self.given_parameters["arrays"]
-        )
+        sizes = self._sizes()
+        kind, arrays = self.given_parameters["kind"], self.given_parameters["arrays"]
+        key = (archive.folder, kind, arrays, sizes)
+        if self._found is not None and self._found[0] == key:
+            return
+        found = read_interface(archive, kind, arrays=arrays, sizes=sizes)
+        quantities = found.parameters | found.text_parameters
+        if found.own:  # those of the run
+            quantities = {n: q for n, q in quantities.items() if n not in ("seed", "member")}
+        names = setting_names(quantities.values(), _is_something)
+        self._quantities = {names[n]: q for n, q in quantities.items()}
+        said = {e.get("variable"): e for e in found.said_of_parameters}
+        settings = {n: declared_setting(q, said.get(q.name)) for n, q in self._quantities.items()}
+        for name in self._found_settings.keys() - settings.keys():
+            if name in self.given_parameters:
+                raise ConfigurationError(
+                    f"'{self.name}.{name}' was set, but '{archive.path}' has no such parameter\n"
+                    f"  {nearest(name, settings, what='it has')}"
+                )
+        for name in settings.keys() & self.given_parameters.keys():
+            if self.given_parameters[name] is not None:
+                settings[name].read(self.given_parameters[name], where=f"'{self.name}.{name}'")
+        self._found_settings, self._found = settings, (key, found)
+
+    def _sizes(self) -> dict[int, int]:
+        """Structural parameters that were set, by reference."""
+        return {
+            self._quantities[n].references[0]: int(self.given_parameters[n])
+            for n, s in self._found_settings.items()
+            if isinstance(s, Size) and self.given_parameters.get(n) is not None
+        }
+
+    def set_parameter(self, name: str, value: object, *, bare: bool = True) -> None:
+        """Set a parameter by name, of the component or of its FMU."""
+        if name not in self.settings() and not self.missing_settings():
+            self.declare_settings()
+        super().set_parameter(name, value, bare=bare)
+        self._from_start -= {name}
+        if isinstance(self._found_settings.get(name), Size):
+            self.declare_settings()  # arrays have another size
+
+    def prepare(self) -> None:
+        """Read the file, and declare its parameters and ports."""
+        self.declare_settings()
+        self._take_parameters_of_start()
+        assert self._found is not None
+        self._interface = found = self._found[1].copy()
+        archive = found.archive
         archive.binary(
             (
                 archive.description.coSimulation
@@ -124,9 +190,44 @@ class Fmu(Component):
         notes: tuple[str, ...] = ()
         if not found.serialize:
             notes = ("its state cannot be saved: no checkpoints",)
-        if found.left_out:
-            notes += (f"{', '.join(found.left_out)} cannot be connected: no numbers",)
+        clocks = found.input_clocks
+        left_out = [name for name in found.left_out if name not in clocks]
+        if left_out:
+            notes += (f"{', '.join(left_out)} cannot be connected: no numbers",)
+        if clocks:
+            notes += (f"its clocks {', '.join(clocks)} never tick: terrafix drives no clocks",)
         self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
+
+    def _take_parameters_of_start(self) -> None:
+        """Make values of ``start`` that are of parameters values of these."""
+        by_name = {q.name: n for n, q in self._quantities.items()}
+        start = dict(self.given_parameters["start"])
+        beyond = {n for n, value in start.items() if self._is_beyond_doubles(n, value)}
+        meant = {by_name[n]: n for n in start if n in by_name and n not in beyond}
+        for own in self.in_order_of_setting(meant):
+            where = f"'{self.name}.start.{meant[own]}'"
+            if own in self.given_parameters and own not in self._from_start:
+                raise ConfigurationError(
+                    f"{where} and '{self.name}.{own}' give one parameter two values\n"
+                    "  leave out that of start"
+                )
+            value = self.settings()[own].read(start.pop(meant[own]), where=where)
+            self.parameter_values[own] = self.given_parameters[own] = value
+            self._from_start |= {own}
+            self.declare_settings()
+        self.parameter_values["start"] = self.given_parameters["start"] = start
+
+    def _is_beyond_doubles(self, name: str, value: object) -> bool:
+        """Whether a whole number is one that a parameter, a double, does not hold."""
+        assert self._found is not None
+        archive, quantity = self._found[1].archive, self._found[1].parameters.get(name)
+        if quantity is None or quantity.kind not in ("Int64", "UInt64"):
+            return False
+        try:
+            read = read_whole(value, quantity.kind, archive.version, quantity.shape, where=name)
+        except ConfigurationError:
+            return False  # this is said of the parameter
+        return any(abs(int(number)) > EXACT for number in read.ravel())
 
     def _observe(self) -> None:
         """Add an output for each variable that `observe` names."""
@@ -141,6 +242,7 @@ class Fmu(Component):
                 interface.archive,
                 str(variable),
                 arrays=self.given_parameters["arrays"],
+                sizes=self._sizes(),
                 where=where,
             )
             port = ImportedPort(name, "signal", False, None, {"": (quantity, None)})
@@ -218,12 +320,13 @@ class Fmu(Component):
     def _read_starts(self) -> dict[str, NDArray[Any]]:
         """Values of ``start``, converted to the units of the variables."""
         known = self.settable()
+        texts = self.interface.text_parameters
         values: dict[str, NDArray[Any]] = {}
         for name, value in self.given_parameters["start"].items():
             if name not in known:
                 raise ConfigurationError(
                     f"'{self.name}.start': the FMU has no parameter or input '{name}'\n"
-                    f"  {nearest(name, known, what='it has')}"
+                    f"  {nearest(name, [*known, *texts], what='it has')}"
                 )
             quantity = known[name]
             if quantity.kind in (*INTEGER, *BOOLEAN):
@@ -249,8 +352,12 @@ class Fmu(Component):
         return self.interface.parameters | inputs
 
     def given_starts(self) -> dict[str, NDArray[Any]]:
-        """Values of ``start`` in the units of the variables."""
-        return dict(self._given)
+        """Numbers that were set, by the FMU's names, in the units of the variables."""
+        found = dict(self._given)
+        for start in self._start_settings():
+            if start.name in self._quantities and not isinstance(start.rows, tuple):
+                found[self._quantities[start.name].name] = start.rows[0]
+        return found
 
     def scalar_names(self) -> dict[str, tuple[str, int]]:
         """Names of the FMU's scalar inputs and outputs: the port, and the place in it."""
@@ -266,6 +373,11 @@ class Fmu(Component):
         """Refuse an FMU whose step does not fit its rate."""
         if self._interface is None:
             return  # its file was refused, and that was said
+        for name in self._found_settings.keys() & self.__dict__.keys():
+            raise ConfigurationError(
+                f"'{self.name}.{name}' was assigned as an attribute, which sets nothing\n"
+                f'  write set_parameter("{name}", ...)'
+            )
         interface = self.interface
         step = getattr(interface.archive.description.coSimulation, "fixedInternalStepSize", None)
         tick = float(step or 0.0)
@@ -292,7 +404,8 @@ class Fmu(Component):
         written = [(p.name, n, q) for p in self._outputs for n, (q, _) in p.fields.items()]
         written += [(p.name, "t", p.t) for p in self._outputs if p.t]
         written += [(p.name, "sequence", p.sequence) for p in self._outputs if p.sequence]
-        inputs, self._input_at = grouped(read)
+        apart = interface.kind != CO_SIMULATION or interface.event_mode
+        inputs, self._input_at = grouped(read, discrete_apart=apart)
         outputs, self._output_at = grouped(written)
         setup = Setup(
             str(Path(self.given_parameters["file"]).absolute()),
@@ -300,10 +413,10 @@ class Fmu(Component):
             env.path,
             inputs,
             outputs,
-            self._start_settings(),
-            self._identities(),
+            (*self._start_settings(), *self._identities()),
             self.given_parameters["solver"],
             self.tolerance_of_solver(),
+            interface.event_mode,
         )
         starts = np.zeros((env.n_members, sum(g.size for g in inputs)))
         self._kinds = {(port, name): q.kind for port, name, q in (*read, *written)}
@@ -332,31 +445,39 @@ class Fmu(Component):
             target[...] = source
         self._publish_messages()
 
-    def _start_settings(self) -> tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]:
+    def _start_settings(self) -> list[Start]:
+        """Parameters that were set, or that members have values of their own of."""
+        found = [
+            start_values(name, self._quantities[name], setting, self.parameter_values[name])
+            for name, setting in self._found_settings.items()
+            if name in self.given_parameters or self._is_dispersed(name, setting)
+        ]
         parameters = self.interface.parameters
-        return tuple(
-            (
-                parameters[name].kind,
-                tuple(parameters[name].references),
-                tuple(value.ravel().tolist()),
-            )
-            for name, value in self._given.items()
-            if name in parameters
-        )
+        for name in self._given.keys() & parameters.keys():  # beyond doubles, or of the run
+            q = parameters[name]
+            structural = q.causality == STRUCTURAL
+            rows = self._given[name].reshape(1, -1)
+            found.append(Start(name, q.kind, tuple(q.references), rows, structural))
+        return found
 
-    def _identities(self) -> tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]:
+    def _is_dispersed(self, name: str, setting: Setting[object]) -> bool:
+        if not isinstance(setting, Parameter) or name not in self.parameter_values:
+            return False
+        return bool(np.any(self.parameter_values[name] != setting.default))
+
+    def _identities(self) -> list[Start]:
         """Seed and member of an FMU of terrafix: its noise is that of the native component."""
         if not self.interface.own:
-            return ()
+            return []
         env = self.environment
         values = {"seed": np.full(env.n_members, env.seed), "member": env.members}
         found = []
         for name, numbers in values.items():
-            quantity = self.interface.parameters.get(name)
-            if quantity is not None and name not in self._given:
-                each = tuple(np.asarray(numbers).tolist())
-                found.append((quantity.kind, tuple(quantity.references), each))
-        return tuple(found)
+            q = self.interface.parameters.get(name)
+            if q is not None and name not in self._given:
+                rows = np.asarray(numbers).reshape(-1, 1)
+                found.append(Start(name, q.kind, tuple(q.references), rows))
+        return found
 
     def _view(self, port: str, name: str) -> NDArray[Any]:
         view = self.port_views[port]
@@ -454,7 +575,7 @@ class Fmu(Component):
         for row, text in failures.items():
             mask = np.zeros(self.n_members, dtype=np.bool_)
             mask[row] = True
-            self.fail(mask, text)
+            (self.end_run if isinstance(text, Ended) else self.fail)(mask, text)
 
     # ------------------------------------------------------------------ messages
 
@@ -524,19 +645,31 @@ def usual_step(rate: Rate | None) -> float:
     return float(next((t for t in rate.times if t), 0))
 
 
+def _is_something(name: str) -> bool:
+    """Whether a name of a component or of its table in a file means something else."""
+    return hasattr(Fmu, name) or name in ATTRIBUTES | KEYS or name in ("rate", "given_parameters")
+
+
 def grouped(
-    quantities: Sequence[tuple[str, str, Quantity]],
+    quantities: Sequence[tuple[str, str, Quantity]], *, discrete_apart: bool = False
 ) -> tuple[tuple[Group, ...], dict[tuple[str, str], slice]]:
-    """Gather quantities by type, side by side in a row; where each one stands."""
-    kinds = list(dict.fromkeys(q.kind for _, _, q in quantities))
+    """Gather quantities by type, side by side in a row; where each one stands.
+
+    With `discrete_apart`, what is set in event mode alone is not mixed with what is continuous.
+    """
+
+    def key(q: Quantity) -> tuple[str, bool]:
+        return q.kind, discrete_apart and (q.variability == "discrete" or q.kind not in REAL)
+
+    kinds = list(dict.fromkeys(key(q) for _, _, q in quantities))
     groups, where, at = [], {}, 0
-    for kind in kinds:
+    for kind, discrete in kinds:
         first, references = at, []
         for port, name, q in quantities:
-            if q.kind != kind:
+            if key(q) != (kind, discrete):
                 continue
             references += q.references
             where[port, name] = slice(at, at + q.size)
             at += q.size
-        groups.append(Group(kind, tuple(references), first, at - first))
+        groups.append(Group(kind, tuple(references), first, at - first, discrete))
     return tuple(groups), where

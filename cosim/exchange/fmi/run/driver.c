@@ -85,7 +85,7 @@ typedef int set3(void *, const uint32_t *, size_t, const double *, size_t);
 typedef int get3(void *, const uint32_t *, size_t, double *, size_t);
 typedef int step3(void *, double, double, _Bool, _Bool *, _Bool *, _Bool *, double *);
 
-enum failure { NONE, SET, STEP, GET, NOT_FINITE, ENDED };
+enum failure { NONE, SET, STEP, GET, NOT_FINITE, ENDED, DISCARDED, EARLY };
 
 struct binding {
     double t, h;
@@ -102,11 +102,13 @@ struct binding {
 
 static enum failure step_one(const struct binding *b, void *instance, const double *in, double *out)
 {
+    enum failure found = NONE;
     if (b->version == 2) {
         if (b->n_inputs && ((set2 *)b->set)(instance, b->input_reference, b->n_inputs, in) > 1)
             return SET;
-        if (((step2 *)b->step)(instance, b->t, b->h, 1) > 1)
-            return STEP;
+        int status = ((step2 *)b->step)(instance, b->t, b->h, 1);
+        if (status > 1)
+            return status == 2 ? DISCARDED : STEP;
         if (b->n_outputs && ((get2 *)b->get)(instance, b->output_reference, b->n_outputs, out) > 1)
             return GET;
     } else {
@@ -118,8 +120,9 @@ static enum failure step_one(const struct binding *b, void *instance, const doub
             return SET;
         if (((step3 *)b->step)(instance, b->t, b->h, 1, &event, &end, &early, &last) > 1)
             return STEP;
-        if (end || early)
-            return ENDED;
+        if (early && !end)
+            return EARLY;
+        found = end ? ENDED : NONE;
         if (b->n_outputs
             && ((get3 *)b->get)(instance, b->output_reference, b->n_output_references, out,
                                 b->n_outputs) > 1)
@@ -131,7 +134,7 @@ static enum failure step_one(const struct binding *b, void *instance, const doub
         if ((bits >> 52 & 0x7FF) == 0x7FF)
             return NOT_FINITE;
     }
-    return NONE;
+    return found;
 }
 
 /* Step all that are active; how many failed. */

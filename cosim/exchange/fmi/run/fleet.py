@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes as ct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,27 +22,42 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import (
     CO_SIMULATION,
+    DISCARD,
+    ENDED,
     HEARD,
+    FmuEndedError,
     FmuError,
     Instance,
     Kept,
     load_library,
     references,
 )
+from terrafix.cosim.exchange.fmi.run.parameters import Start
 from terrafix.cosim.exchange.fmi.run.solvers import Integrator
 from terrafix.cosim.exchange.fmi.run.whole import INTEGER, MOST, cells
 from terrafix.cosim.kernels import toolchain
 
 Failures = dict[int, str]
-"""Row of a member to what went wrong."""
+"""Row of a member to what went wrong, or to an `Ended`."""
 MODEL_EXCHANGE_TOLERANCE = 1e-10
+
+
+class Ended(str):
+    """What is said of a member whose FMU ended the simulation, as it may."""
+
+
+def _said(error: FmuError) -> str:
+    return Ended(error) if isinstance(error, FmuEndedError) else str(error)
+
+
 _DOUBLE = ("Real", "Float64")
-_STEP, _NOT_FINITE = 2, 4  # of `enum failure` in driver.c
+_STEP, _NOT_FINITE, _ENDED, _DISCARDED = 2, 4, 5, 6  # of `enum failure` in driver.c
 _REASONS = {
     1: "Set: inputs were refused",
     2: "DoStep did not succeed",
     3: "Get: outputs could not be read",
-    5: "DoStep: the FMU asks to end the simulation, or returned early",
+    6: "DoStep did not succeed",
+    7: "DoStep: the FMU returned early",
 }
 
 
@@ -54,6 +69,7 @@ class Group:
     references: tuple[int, ...]
     start: int
     size: int
+    discrete: bool = False
 
 
 @dataclass(frozen=True)
@@ -69,11 +85,13 @@ class Setup:
         Of the component.
     inputs, outputs : tuple of Group
         What is set before and read after each step.
-    starts : tuple of (str, tuple of int, tuple of float)
-        Type, value references and values set before initialization.
+    starts : tuple of Start
+        Values set before initialization.
     solver : str
     tolerance : float or None
         Of the integrator in model exchange; in co-simulation handed on to the FMU, if there is one.
+    event_mode : bool
+        Of co-simulation with FMI 3.
     """
 
     file: str
@@ -81,10 +99,14 @@ class Setup:
     name: str
     inputs: tuple[Group, ...]
     outputs: tuple[Group, ...]
-    starts: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
-    each: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
+    starts: tuple[Start, ...] = ()
     solver: str = "cvode"
     tolerance: float | None = None
+    event_mode: bool = False
+
+    def of(self, members: Sequence[int]) -> Setup:
+        """What a fleet of some of its members is made from."""
+        return replace(self, starts=tuple(start.of(members) for start in self.starts))
 
 
 @dataclass(frozen=True)
@@ -147,10 +169,13 @@ class _Quick:
     def _call(self) -> None:
         if self._set is not None and self._set(*self._set_arguments) > 1:
             raise FmuError(f"{_REASONS[1]}{self._instance.said()}")
-        if self._step(*self._step_arguments) > 1:
+        status = self._step(*self._step_arguments)
+        if status > 1:
+            if status == DISCARD and self._instance.ended():
+                raise FmuEndedError(ENDED)
             raise FmuError(f"{_REASONS[2]}{self._instance.said()}")
         if self._ended is not None and (self._ended[0].value or self._ended[1].value):
-            raise FmuError(_REASONS[5])
+            raise FmuEndedError(ENDED) if self._ended[0].value else FmuError(_REASONS[7])
         if self._get is not None and self._get(*self._get_arguments) > 1:
             raise FmuError(f"{_REASONS[3]}{self._instance.said()}")
 
@@ -207,6 +232,13 @@ class Fleet:
         self.outputs = np.zeros((n_members, sum(g.size for g in setup.outputs)))
         self.instances: list[Instance | None] = [None] * n_members
         self._integrators: dict[int, Integrator] = {}
+        self._discrete = np.concatenate(
+            [
+                np.arange(0),
+                *(np.arange(g.start, g.start + g.size) for g in setup.inputs if g.discrete),
+            ]
+        )
+        self._last: dict[int, NDArray[np.int64]] = {}  # bits of discrete inputs, as they were set
         self._active = np.zeros(n_members, dtype=np.uint8)
         self._failed = np.zeros(n_members, dtype=np.uint8)
         self._references = {g: references(g.references) for g in (*setup.inputs, *setup.outputs)}
@@ -225,19 +257,22 @@ class Fleet:
             try:
                 self._start_one(row, messages)
             except FmuError as error:
-                self._failed[row] = _STEP
-                failures[row] = str(error)
+                self._note(row, error, failures)
         self._active[:] = active
         self._live = self._find_live()
         self._prepare_calls()
         return failures
 
     def _start_one(self, row: int, messages: Sequence[Message]) -> None:
-        instance = self.instances[row] = Instance(self.library, f"{self.setup.name}_{row}")
-        for kind, vr, values in self.setup.starts:
-            instance.set(kind, references(vr), values)
-        for kind, vr, values in self.setup.each:
-            instance.set(kind, references(vr), values[row])
+        name = f"{self.setup.name}_{row}"
+        instance = Instance(self.library, name, event_mode=self.setup.event_mode)
+        self.instances[row] = instance
+        structural = [s for s in self.setup.starts if s.structural]
+        if structural:
+            instance.call("EnterConfigurationMode")
+            self._set_starts(instance, row, structural)
+            instance.call("ExitConfigurationMode")
+        self._set_starts(instance, row, [s for s in self.setup.starts if not s.structural])
         tolerance = self.setup.tolerance
         instance.begin(0.0, tolerance if self.setup.kind == CO_SIMULATION else None)
         self._set_all(instance, row)
@@ -252,10 +287,26 @@ class Fleet:
                 self.setup.solver,
                 tolerance or MODEL_EXCHANGE_TOLERANCE,
             )
+        self._last[row] = self.inputs[row, self._discrete].view(np.int64)
         self._get_all(instance, row)
 
-    def _set_all(self, instance: Instance, row: int) -> None:
+    def _set_starts(self, instance: Instance, row: int, starts: Sequence[Start]) -> None:
+        for start in starts:
+            vr, rows = references(start.references), start.rows
+            try:
+                if isinstance(rows, tuple):
+                    instance.set_texts(vr, rows)
+                else:
+                    instance.set(start.kind, vr, rows[row if len(rows) > 1 else 0])
+            except FmuError as error:
+                raise FmuError(f"its '{start.name}' was refused: {error}", error.status) from error
+
+    def _set_all(
+        self, instance: Instance, row: int, *, discrete: tuple[bool, ...] = (False, True)
+    ) -> None:
         for group in self.setup.inputs:
+            if group.discrete not in discrete:
+                continue
             columns = slice(group.start, group.start + group.size)
             values = cells(self.inputs, group.kind, columns)[row]
             instance.set(group.kind, self._references[group], values)
@@ -279,7 +330,7 @@ class Fleet:
         """
         groups = (self.setup.inputs, self.setup.outputs)
         real = all(len(g) <= 1 and all(x.kind in _DOUBLE for x in g) for g in groups)
-        if not real or self.setup.kind != CO_SIMULATION:
+        if not real or self.setup.kind != CO_SIMULATION or self.setup.event_mode:
             return
         self._quick = {
             row: _Quick(instance, self)
@@ -335,8 +386,7 @@ class Fleet:
             try:
                 self._step_one(row, t, h)
             except FmuError as error:
-                self._failed[row] = _STEP
-                failures[row] = str(error)
+                self._note(row, error, failures)
         if failures:
             self._live = self._find_live()
         return failures
@@ -354,9 +404,19 @@ class Fleet:
                     if instance is not None and self._active[row]:
                         message.send(row, instance)
             except FmuError as error:
-                self._failed[row] = _STEP
-                failures[row] = str(error)
+                self._note(row, error, failures)
         return failures
+
+    def _note(self, row: int, error: FmuError, failures: Failures) -> None:
+        """Note why a member is not stepped any more; one that ended shows its last values."""
+        self._failed[row], failures[row] = _STEP, _said(error)
+        instance = self.instances[row]
+        if isinstance(error, FmuEndedError) and instance is not None:
+            self._failed[row] = _ENDED
+            try:
+                self._get_all(instance, row)
+            except FmuError as wrong:
+                self._failed[row], failures[row] = _STEP, str(wrong)
 
     def _step_one(self, row: int, t: float, h: float) -> None:
         if quick := self._quick.get(row):
@@ -364,9 +424,18 @@ class Fleet:
             return
         instance = self.instances[row]
         assert instance is not None
-        self._set_all(instance, row)
-        if row in self._integrators:
-            self._integrators[row].advance(t, h)
+        now = self.inputs[row, self._discrete].view(np.int64)
+        integrator = self._integrators.get(row)
+        if not len(now):
+            self._set_all(instance, row)
+        elif row in self._last and np.array_equal(now, self._last[row]):
+            self._set_all(instance, row, discrete=(False,))
+        else:  # discrete inputs that changed are set in event mode
+            handle = instance.handle if integrator is None else integrator.handle
+            handle(t, lambda: self._set_all(instance, row))
+            self._last[row] = now
+        if integrator is not None:
+            integrator.advance(t, h)
         else:
             instance.step(t, h)
         self._get_all(instance, row)
@@ -378,6 +447,9 @@ class Fleet:
             instance = self.instances[row]
             assert instance is not None
             self._active[row] = 0
+            if code == _ENDED or (code == _DISCARDED and instance.ended()):
+                self._note(row, FmuEndedError(ENDED), found)
+                continue
             what = "an output is not finite" if code == _NOT_FINITE else (
                 f"fmi{self.library.version}{_REASONS[code]}{instance.said()}"
             )  # fmt: skip
@@ -408,6 +480,7 @@ class Fleet:
                 instance.deserialize(bytes(data))
                 if row in self._integrators:
                     self._integrators[row].restart()
+                self._last.pop(row, None)  # discrete inputs are set anew
 
     def mark(self) -> None:
         """Keep the present state of every instance that is stepped, to return to."""
@@ -435,7 +508,7 @@ class Fleet:
                 continue
             self.instances[row] = None
             try:
-                if not self._failed[row]:
+                if self._failed[row] in (0, _ENDED):
                     instance.terminate()
             except FmuError:
                 pass  # it is freed all the same

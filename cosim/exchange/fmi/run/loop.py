@@ -20,7 +20,7 @@ from terrafix.cosim.declare.parameters import Count, FileTable, Parameter, Text
 from terrafix.cosim.declare.ports import Capabilities, Input, Output, Port
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION
 from terrafix.cosim.exchange.fmi.run.component import Fmu, grouped, usual_step
-from terrafix.cosim.exchange.fmi.run.fleet import Setup
+from terrafix.cosim.exchange.fmi.run.fleet import Ended, Setup
 from terrafix.cosim.exchange.fmi.run.places import AnyFleet, make_fleet
 from terrafix.cosim.system.wiring import check_connection, port_factor
 
@@ -203,7 +203,8 @@ class FmuLoop(Component):
         for row, text in failures.items():
             mask = np.zeros(self.n_members, dtype=np.bool_)
             mask[row] = True
-            self.fail(mask, f"'{name}': {text}")
+            end = self.end_run if isinstance(text, Ended) else self.fail
+            end(mask, f"'{name}': {text}")
 
     # ------------------------------------------------------------------ state
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import TerrafixError
@@ -67,12 +64,11 @@ def _self_test(
 ) -> Disturbance | None:
     key = (str(interface.archive.folder), setup.kind)
     if key not in _known:
-        rows: NDArray[np.int64] = np.arange(2) % len(inputs)
-        each = tuple((kind, vr, tuple(v[r] for r in rows)) for kind, vr, v in setup.each)
+        rows: list[int] = (np.arange(2) % len(inputs)).tolist()
         worker = Worker(MODULE, f"the FMU '{setup.file}'")
         try:
             _known[key] = worker.call(
-                "rehearse", replace(setup, each=each), inputs[rows], h, FIRST_LIMIT,
+                "rehearse", setup.of(rows), inputs[rows], h, FIRST_LIMIT,
                 limit=3 * FIRST_LIMIT,
             )  # fmt: skip
         except TerrafixError:

@@ -9,8 +9,8 @@ identifiers are written with underscores.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,8 @@ from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, whole_start
 from terrafix.cosim.memory.fields import Field, Unit
 
 REAL = ("Real", "Float64", "Float32")
+CONNECTED = ("input", "output")
+PARAMETERS = ("parameter", "structuralParameter")
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\d+)*)\]\Z")
 
 
@@ -45,6 +47,10 @@ class Quantity:
     doc : str
     base : int
         Index of the first element, in names.
+    variables : sequence
+        As FMPy read them.
+    texts : list of str or None
+        Start values of a String.
     """
 
     name: str
@@ -57,6 +63,8 @@ class Quantity:
     variability: str = "continuous"
     doc: str = ""
     base: int = 1
+    variables: Sequence[Any] = ()
+    texts: list[str] | None = None
 
     @property
     def size(self) -> int:
@@ -118,6 +126,8 @@ class Interface:
         ``"co-simulation"`` or ``"model exchange"``: how it is run.
     ports : list of ImportedPort
     parameters : dict of str to Quantity
+        Numbers.
+    text_parameters : dict of str to Quantity
     left_out : list of str
         Inputs and outputs of types that have no port (text, binary, clocks).
     state, serialize : bool
@@ -137,10 +147,53 @@ class Interface:
     serialize: bool
     own: bool
     once: bool = False
+    text_parameters: dict[str, Quantity] = field(default_factory=dict)
+
+    @property
+    def event_mode(self) -> bool:
+        """Whether its co-simulation is to be run with event mode (FMI 3): it has it, and a use.
+
+        Discrete inputs are set and clocks tick there. Without them an FMU handles events itself.
+        """
+        interface = self.archive.description.coSimulation
+        if self.kind != CO_SIMULATION or not getattr(interface, "hasEventMode", False):
+            return False
+        return any(
+            v.type == "Clock" or (v.causality == "input" and v.variability == "discrete")
+            for v in self.archive.description.modelVariables
+        )
+
+    @property
+    def input_clocks(self) -> list[str]:
+        """Clocks that its environment should let tick."""
+        variables = self.archive.description.modelVariables
+        return [v.name for v in variables if v.type == "Clock" and v.causality == "input"]
+
+    @property
+    def said_of_parameters(self) -> list[Any]:
+        """What the annotation says of parameters: frames, and which must be positive."""
+        found = self.archive.annotation
+        return [] if found is None else list(found.iter("Parameter"))
+
+    def copy(self) -> Interface:
+        """One whose ports can be added to, and their units changed."""
+        ports = [
+            replace(p, fields={n: (replace(q), frame) for n, (q, frame) in p.fields.items()})
+            for p in self.ports
+        ]
+        return replace(self, ports=ports)
 
 
-def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True) -> Interface:
+def read_interface(
+    archive: Archive,
+    kind: str = "auto",
+    *,
+    arrays: bool = True,
+    sizes: Mapping[int, int] | None = None,
+) -> Interface:
     """Read ports, parameters and capabilities; without `arrays`, every scalar is a port.
+
+    `sizes` are values of structural parameters by reference, where they are not the start values.
 
     Raises
     ------
@@ -165,30 +218,30 @@ def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True)
             f'  write kind = "{offered[0]}", or leave it out'
         )
     interface = description.coSimulation if chosen == CO_SIMULATION else description.modelExchange
-    quantities, left_out = _quantities(archive, arrays=arrays)
+    quantities, left_out = _quantities(archive, arrays=arrays, sizes=sizes or {})
+    parameters = [q for q in quantities if q.causality in PARAMETERS]
     found = archive.annotation if arrays else None
     ports = _own_ports(archive, found, quantities) if found is not None else _ports(quantities)
     return Interface(
         archive,
         chosen,
         ports,
-        {q.name: q for q in quantities if q.causality in ("parameter", "structuralParameter")},
+        {q.name: q for q in parameters if q.kind != "String"},
         left_out,
         bool(interface.canGetAndSetFMUstate),
         bool(interface.canGetAndSetFMUstate and interface.canSerializeFMUstate),
         own=archive.annotation is not None,
         once=bool(interface.canBeInstantiatedOnlyOncePerProcess),
+        text_parameters={q.name: q for q in parameters if q.kind == "String"},
     )
 
 
 # --------------------------------------------------------------------------------- variables
 
 
-CONNECTED = ("input", "output")
-PARAMETERS = ("parameter", "structuralParameter")
-
-
-def observed(archive: Archive, name: str, *, arrays: bool, where: str) -> Quantity:
+def observed(
+    archive: Archive, name: str, *, arrays: bool, sizes: Mapping[int, int], where: str
+) -> Quantity:
     """A local variable or parameter by its name, whole or one element; `where` names who asks.
 
     Raises
@@ -198,8 +251,8 @@ def observed(archive: Archive, name: str, *, arrays: bool, where: str) -> Quanti
     """
     wanted = ("local", "calculatedParameter", *PARAMETERS)
     for together in (True, False) if arrays else (False,):
-        for quantity in _quantities(archive, arrays=together, wanted=wanted)[0]:
-            if quantity.name == name:
+        for quantity in _quantities(archive, arrays=together, sizes=sizes, wanted=wanted)[0]:
+            if quantity.name == name and quantity.kind != "String":
                 return quantity
     known = {v.name: v for v in archive.description.modelVariables}
     if name not in known:
@@ -214,7 +267,11 @@ def observed(archive: Archive, name: str, *, arrays: bool, where: str) -> Quanti
 
 
 def _quantities(
-    archive: Archive, *, arrays: bool, wanted: Sequence[str] = (*CONNECTED, *PARAMETERS)
+    archive: Archive,
+    *,
+    arrays: bool,
+    sizes: Mapping[int, int],
+    wanted: Sequence[str] = (*CONNECTED, *PARAMETERS),
 ) -> tuple[list[Quantity], list[str]]:
     """Inputs, outputs and parameters, elements of arrays together."""
     units = Units(archive)
@@ -224,7 +281,8 @@ def _quantities(
         causality = variable.causality or "local"
         if causality not in wanted:
             continue
-        if variable.type not in (*REAL, *INTEGER, *BOOLEAN):
+        text = variable.type == "String" and variable.causality in PARAMETERS
+        if not text and variable.type not in (*REAL, *INTEGER, *BOOLEAN):
             if variable.causality in ("input", "output"):
                 left_out.append(variable.name)
             continue
@@ -238,11 +296,11 @@ def _quantities(
         shape = _extent([index for index, _ in members])
         same = len({(v.type, v.variability) for _, v in members}) == 1
         if shape is not None and same:
-            made = _quantity(name, shape, [v for _, v in members], units)
+            made = _quantity(name, shape, [v for _, v in members], units, sizes)
             made.base = min(min(index) for index, _ in members) if shape else 1
             quantities.append(made)
         else:
-            quantities += [_quantity(v.name, (), [v], units) for _, v in members]
+            quantities += [_quantity(v.name, (), [v], units, sizes) for _, v in members]
     return quantities, left_out
 
 
@@ -259,26 +317,40 @@ def _extent(indices: Sequence[tuple[int, ...]]) -> tuple[int, ...] | None:
 
 
 def _quantity(
-    name: str, shape: tuple[int, ...], members: Sequence[Any], units_of: Units
+    name: str,
+    shape: tuple[int, ...],
+    members: Sequence[Any],
+    units_of: Units,
+    sizes: Mapping[int, int],
 ) -> Quantity:
     first = members[0]
     if first.dimensions or first.shape:
-        shape = tuple(int(n) for n in (first.shape or ()))
+        shape = tuple(
+            sizes.get(d.valueReference, n) if d.start is None else n
+            for d, n in zip(first.dimensions, map(int, first.shape or ()), strict=True)
+        )
     units = tuple(units_of(v) for v in members)
     unit: Unit = units[0] if len(set(units)) == 1 else units
     if len(shape) == 2 and not isinstance(unit, str):
         last = units[: shape[-1]]
         unit = last if units == last * shape[0] else "1"
+    text = first.type == "String"
+    size = int(np.prod(shape, dtype=np.int64))
+    starts = None if text else _starts(members)
+    if starts is not None and len(starts) != size:  # of the size that it has otherwise
+        starts = starts * size if len(starts) == 1 else None
     return Quantity(
         name,
         first.type,
         [int(v.valueReference) for v in members],
         shape,
         unit,
-        _starts(members),
+        starts,
         first.causality,
         first.variability or "continuous",
         " ".join((first.description or "").split()),
+        variables=tuple(members),
+        texts=_texts(members, size) if text else None,
     )
 
 
@@ -313,6 +385,13 @@ class Units:
         except ConfigurationError:
             return "1"
         return name
+
+
+def _texts(members: Sequence[Any], size: int) -> list[str] | None:
+    found: list[str] = []
+    for text in (v.start for v in members):
+        found += [] if text is None else [text] if isinstance(text, str) else [str(t) for t in text]
+    return found if len(found) == size else None
 
 
 def _starts(members: Sequence[Any]) -> list[float] | list[int] | None:

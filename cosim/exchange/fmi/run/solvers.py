@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes as ct
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,16 @@ import numpy as np
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.exchange.fmi.run.archive import Archive
-from terrafix.cosim.exchange.fmi.run.binding import FmuError, Instance
+from terrafix.cosim.exchange.fmi.run.binding import MOST_EVENTS, FmuError, Instance
 
 SOLVERS = ("cvode", "dop853")
+
+
+def _as_nominal(values: FloatArray) -> FloatArray:
+    """Make nominal values usable in place: a size, and 1 where 0 is given, which is none."""
+    np.abs(values, out=values)
+    values[values == 0.0] = 1.0
+    return values
 
 
 class _NoInput:
@@ -58,9 +66,9 @@ class Integrator:
                 f"'{archive.path}' has {self._n_indicators} event indicators, which dop853 does "
                 'not watch\n  write solver = "cvode"'
             )
-        self._events(t)
+        self._events()  # it is in event mode since its initialization, and knows the time
         self._cvode: Any = None
-        if solver == "cvode":
+        if solver == "cvode" and (self._n or self._n_indicators):
             self._cvode = self._make_cvode(t)
 
     def _count(self, name: str, otherwise: int) -> int:
@@ -70,22 +78,28 @@ class Integrator:
         self._fmu.call(name, ct.byref(n))
         return int(n.value)
 
-    def _events(self, t: float) -> None:
-        """Handle events at a time, in event mode already."""
-        self._fmu.set_time(t)
+    def _events(self) -> None:
+        """Handle events of the present time, in event mode already."""
         _, self._next_event = self._fmu.discrete_update()
         self._fmu.call("EnterContinuousTimeMode")
 
-    def _handle(self, t: float) -> None:
-        """Handle events; the solver goes on as it was where the equations did not change."""
+    def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
+        """Handle events at the present time, and what `change` sets in event mode.
+
+        The solver goes on as it was where the equations did not change.
+        """
         before = self._moment()
         self._fmu.call("EnterEventMode")
-        self._events(t)
+        if change is not None:
+            change()
+        self._events()
         if not np.array_equal(before, self._moment()):
             self.restart(t)
 
     def _moment(self) -> FloatArray:
         """Continuous states and their derivatives, now."""
+        if not self._n:
+            return np.empty(0)
         states = self._fmu.get_vector("GetContinuousStates", self._n)
         return np.concatenate([states, self._fmu.rates(self._n)])
 
@@ -112,8 +126,10 @@ class Integrator:
         if self._stale and self._cvode is not None:
             self._cvode.reset(t)
             self._stale = False
+        handled = 0
         try:
             while t < end:
+                begun = t
                 due = self._next_event is not None and self._next_event <= end
                 stop = float(self._next_event) if due and self._next_event is not None else end
                 stop = max(stop, t)
@@ -122,7 +138,12 @@ class Integrator:
                     state_event, t = self._integrate(t, stop)
                 step_event = self._fmu.completed_step()
                 if state_event or step_event or (due and t >= stop):
-                    self._handle(t)
+                    self.handle(t)
+                    handled = 0 if t > begun else handled + 1
+                    if handled > MOST_EVENTS:
+                        raise FmuError(
+                            f"it asks for event after event at t = {t:.9g} s: time stands still"
+                        )
         except RuntimeError as error:  # of FMPy's CVode
             raise FmuError(f"the solver failed: {error}") from error
 
@@ -135,7 +156,7 @@ class Integrator:
             from scipy.integrate import solve_ivp
 
             x = self._fmu.get_vector("GetContinuousStates", self._n)
-            nominal = self._fmu.get_vector("GetNominalsOfContinuousStates", self._n)
+            nominal = _as_nominal(self._fmu.get_vector("GetNominalsOfContinuousStates", self._n))
             found = solve_ivp(
                 self._rates, (t, stop), x, "DOP853",
                 rtol=max(self._tolerance, 3e-14), atol=self._tolerance * nominal,
@@ -163,6 +184,10 @@ class Integrator:
         def vector(name: str) -> Any:
             return lambda pointer, n: fmu.call(name, pointer, ct.c_size_t(n))
 
+        def nominals(pointer: Any, n: int) -> None:
+            fmu.call("GetNominalsOfContinuousStates", pointer, ct.c_size_t(n))
+            _as_nominal(np.ctypeslib.as_array(pointer, (n,)))
+
         return CVodeSolver(
             nx=self._n,
             nz=self._n_indicators,
@@ -170,7 +195,7 @@ class Integrator:
             set_x=vector("SetContinuousStates"),
             get_dx=vector(rates),
             get_z=vector("GetEventIndicators"),
-            get_nominals=vector("GetNominalsOfContinuousStates"),
+            get_nominals=nominals,
             set_time=fmu.set_time,
             input=_NoInput(),
             startTime=t,

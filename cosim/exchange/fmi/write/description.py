@@ -164,6 +164,13 @@ class _Writer:
                     field.set("frame", variable.frame)
                 if not isinstance(variable.unit, str):
                     field.set("units", "|".join(variable.unit))
+        for variable in self.layout.reals:
+            if variable.causality == "parameter":
+                made = ET.SubElement(element, "Parameter", {"variable": variable.name})
+                if variable.frame:
+                    made.set("frame", variable.frame)
+                if variable.positive:
+                    made.set("positive", "true")
         return element
 
     def bounds(self, variable: Variable) -> dict[str, str]:

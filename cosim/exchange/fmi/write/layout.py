@@ -394,6 +394,7 @@ class Layout:
                     declared.shape,
                     np.asarray(component.setting(name), dtype=np.float64),
                     unit=declared.unit,
+                    frame=declared.frame,
                     doc=_sentence(declared.doc),
                     minimum=declared.minimum,
                     maximum=declared.maximum,

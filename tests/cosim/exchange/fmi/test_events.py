@@ -1,0 +1,190 @@
+"""Events of imported FMUs: discrete inputs, time events, models without states, an early end."""
+
+from __future__ import annotations
+
+import eventful
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from terrafix.cli import main
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import StepError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.ports import Output
+from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.exchange.fmi.run import fleet
+from terrafix.cosim.exchange.fmi.run.component import Fmu
+from terrafix.cosim.files.writing import write_system
+from terrafix.cosim.records.checkpoint import read_checkpoint, write_checkpoint
+from terrafix.cosim.system.dispersion import Dispersion
+from terrafix.cosim.system.system import System
+
+
+class Stairs(Component):
+    """k at the k-th step, and whether k is odd."""
+
+    default_rate = Rate("0.1")
+
+    u = Output((), unit="1")
+    b = Output((), unit="1", dtype=np.bool_)
+
+    def _initialize_impl(self):
+        self.port_views["u"][...], self.port_views["b"][...] = 0.0, False
+
+    def _step_impl(self, t, dt):
+        self.port_views["u"][...] = self.step_index
+        self.port_views["b"][...] = self.step_index % 2 == 1
+
+
+def driven(file, **options):
+    with System("driven") as system:
+        system.add(Stairs(), "stairs")
+        system.add(Fmu(file=file, rate=Rate("0.1"), **options), "part")
+        system.connect("stairs.u", "part.u")
+        system.connect("stairs.b", "part.b")
+        system.record("history", ["part.y"])
+    return system
+
+
+# ------------------------------------------------------------------ model exchange
+
+
+@pytest.mark.parametrize("solver", ["cvode", "dop853"])
+@pytest.mark.parametrize("n_states", [0, 1])
+def test_discrete_inputs_time_events_and_zero_nominals(tmp_path, solver, n_states):
+    """The FMU refuses any call in a mode that FMI 2 does not allow it in.
+
+    At t = 1 s: x = 0.1 (0 + 1 + ... + 9) = 4.5, four events of 0.25 s, and the step began with
+    u = 9 and b = 1. The nominal value of x is 0.
+    """
+    file = eventful.strict(tmp_path / "strict.fmu", n_states=n_states)
+    y = simulate(driven(file, solver=solver), duration="1").dataset["part.y"].values[:, 0]
+    assert y[0].tolist() == [0.0, 0.0, 0.0]
+    assert y[-1, 1:].tolist() == [4.0, 19.0]
+    assert y[-1, 0] == pytest.approx(4.5 if n_states else 0.0, abs=1e-9)
+    assert y[:, 1].tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4]
+
+
+def test_an_fmu_that_asks_for_an_event_again_and_again(tmp_path):
+    file = eventful.strict(tmp_path / "stuck.fmu", n_states=1, stuck=True)
+    with pytest.raises(StepError, match=r"event after event at t = 0.25 s: time stands still"):
+        simulate(driven(file), duration="1")
+
+
+# ------------------------------------------------------------------ co-simulation with FMI 3
+
+
+def test_event_mode_of_co_simulation(tmp_path):
+    """The FMU refuses discrete inputs outside of event mode, and steps over its own events.
+
+    y = (integral of u, number of time events every 0.25 s, number of its own events at every
+    0.15 s, where it returns early): at t = 1 s 4.5, 4 and 6.
+    """
+    file = eventful.stepping(tmp_path / "stepping.fmu")
+    y = simulate(driven(file), duration="1").dataset["part.y"].values[:, 0]
+    assert y[-1] == pytest.approx([4.5, 4.0, 6.0], abs=1e-12)
+    assert y[:, 1].tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4]
+    assert y[:, 2].tolist() == [0, 0, 1, 2, 2, 3, 4, 4, 5, 6, 6]
+
+
+def test_clocks_that_never_tick_are_told(tmp_path):
+    clock = '<Clock name="c" valueReference="9" causality="input" intervalVariability="triggered"/>'
+    xml = eventful.STEPPING_XML.replace("</ModelVariables>", f"{clock}</ModelVariables>")
+    file = eventful.make_fmu(tmp_path / "clock.fmu", eventful.STEPPING, xml, fmi=3)
+    assert (
+        driven(file).check().notes[1]
+        == "'part': its clocks c never tick: terrafix drives no clocks"
+    )
+
+
+# ------------------------------------------------------------------ an FMU that ends its simulation
+
+
+def ending(file, stops, **options):
+    with System("ending") as system:
+        system.add(Fmu(file=file, rate=Rate("0.1"), **options), "part")
+        system.disperse(Dispersion("stop", ("part.stop",), stops, kind="list"))
+        system.record("history", ["part.y"])
+    return system
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("way", ["driver", "ctypes", "isolated"])
+def test_a_member_whose_fmu_ends_is_complete_and_the_others_go_on(tmp_path, monkeypatch, fmi, way):
+    """Member 0 ends itself at t = 0.3 s, and shows y = 0.3 when it says so, in the next step."""
+    if way == "ctypes":
+        monkeypatch.setattr(fleet, "_driver", lambda: None)
+    file = eventful.ending(tmp_path / "ending.fmu", fmi=fmi)
+    result = simulate(
+        ending(file, [0.3, 9.0], isolate=way == "isolated"), members=2, duration="0.8"
+    )
+    assert (result.status, result.excluded) == ("complete", [])
+    (note,) = result.notes
+    assert note.startswith("'part' ended the run of member 0 at t = 0.4 s: the FMU asks to end")
+    y = result.dataset["part.y"].values
+    assert y[:, 0] == pytest.approx([0, 0.1, 0.2, 0.3, 0.3] + [np.nan] * 4, nan_ok=True)
+    assert y[:, 1] == pytest.approx(np.arange(9) / 10)
+
+
+def test_a_run_whose_members_have_all_ended_is_complete(tmp_path):
+    """With status 0 and what was recorded until then; so does a campaign."""
+    file = eventful.ending(tmp_path / "ending.fmu", fmi=3)
+    system = ending(file, [0.3, 0.5])
+    result = simulate(system, members=2, duration="0.8")
+    assert result.status == "complete"
+    assert result.dataset["part.y"].values.shape[0] == 7
+    assert [n.split(" at ")[0] for n in result.notes] == [
+        "'part' ended the run of member 0",
+        "'part' ended the run of member 1",
+    ]
+    write_system(system, tmp_path / "s.toml")
+    done = CliRunner().invoke(main, ["run", str(tmp_path / "s.toml"), "--duration", "0.8 s"])
+    assert done.exit_code == 0, done.output
+    assert "ended the run of member 0 at t = 0.4 s" in done.output + done.stderr
+
+
+def test_model_exchange_that_ends_itself(tmp_path):
+    """At the second event, t = 0.5 s, whose values are the last."""
+    file = eventful.strict(tmp_path / "strict.fmu", n_states=1, ends=True)
+    result = simulate(driven(file), duration="1")
+    assert result.status == "complete"
+    assert result.notes == [
+        "'part' ended the run of member 0 at t = 0.5 s: the FMU asks to end the simulation"
+    ]
+    assert result.dataset["part.y"].values[-1, 0].tolist() == [pytest.approx(1.0), 2.0, 4.0]
+
+
+def test_a_step_that_is_discarded_for_another_reason_is_a_failure(tmp_path):
+    file = eventful.ending(tmp_path / "ending.fmu", fmi=2, ends=False)
+    result = simulate(ending(file, [0.3, 9.0]), members=2, duration="0.8")
+    assert [(e["member"], e["t_s"], e["reason"]) for e in result.excluded] == [
+        (0, 0.4, "fmi2DoStep did not succeed")
+    ]
+
+
+def test_ended_members_stay_ended_over_a_checkpoint(spring, tmp_path):
+    """An FMU that can save its state: the spring, ended by another component."""
+    with System("kept") as system:
+        system.add(Fmu(file=spring(3), rate=Rate("0.1")), "part")
+        system.add(Stop(), "stop")
+    first = Simulation(system, members=2)
+    first.run_until("0.3")
+    write_checkpoint(tmp_path / "run.ckpt", first.get_state())
+    first.master.terminate()
+    second = Simulation(system, members=2)
+    second.set_state(read_checkpoint(tmp_path / "run.ckpt"))
+    assert [(e["member"], e["t_s"]) for e in second.master.ended] == [(1, 0.2)]
+    assert second.master.active.tolist() == [True, False]
+    second.master.terminate()
+
+
+class Stop(Component):
+    """Ends the run of the second member at its second step."""
+
+    default_rate = Rate("0.1")
+
+    def _step_impl(self, t, dt):
+        if self.step_index == 2:
+            self.end_run([False, True], "enough")
