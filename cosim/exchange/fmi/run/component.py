@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
-from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Choice, FilePath, Flag, Parameter, Table
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -25,6 +24,7 @@ from terrafix.cosim.declare.ports import (
     Output,
     Port,
 )
+from terrafix.cosim.declare.settling import Settling
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
 from terrafix.cosim.exchange.fmi.run.fleet import Failures, Fleet, Group, Message, Setup
@@ -32,6 +32,7 @@ from terrafix.cosim.exchange.fmi.run.reading import (
     ImportedPort,
     Interface,
     Quantity,
+    initial_dependencies,
     read_interface,
 )
 from terrafix.cosim.exchange.fmi.run.remote import RemoteFleet
@@ -41,7 +42,7 @@ from terrafix.cosim.memory.messages import MessageReader
 from terrafix.cosim.memory.slots import BundleView
 
 
-class Fmu(Component):
+class Fmu(Settling):
     """A Functional Mock-up Unit, FMI 2 or 3, one instance for each member.
 
     Ports, units, arrays and start values are those of its model description. Inputs of an FMU that
@@ -65,6 +66,7 @@ class Fmu(Component):
     frames = Table(doc="frames of ports by name, where the FMU does not say")
     solver = Choice(SOLVERS, "cvode", doc="integrator of model exchange")
     tolerance = Parameter(1e-10, positive=True, doc="relative, of that integrator")
+    start_time = Parameter(0.0, unit="s", doc="time of the FMU at t = 0")
     isolate = Flag(False, doc="run it in a process of its own: slower, but its crash is survived")
     time_limit = Parameter(
         60.0, unit="s", positive=True, doc="longest answer of an isolated FMU, in real time"
@@ -72,6 +74,8 @@ class Fmu(Component):
 
     _interface: Interface | None = None
     _fleet: Fleet | RemoteFleet | None = None
+    _needs: dict[str, set[str]] | None = None
+    _begun = False
 
     # ------------------------------------------------------------------ declaration
 
@@ -95,6 +99,7 @@ class Fmu(Component):
                 else archive.description.modelExchange
             ).modelIdentifier
         )
+        self._needs = None
         self._given = self._read_starts()
         self.ports = {port.name: self._port(port) for port in found.ports}
         for table in ("units", "frames"):
@@ -224,7 +229,52 @@ class Fmu(Component):
 
     # ------------------------------------------------------------------ life cycle
 
+    def taken_at_start(self) -> set[str]:
+        """Inputs that it takes in initialization mode: all but those that hold start values."""
+        held = self.given_parameters["hold_start_values"]
+        return {n for n in super().taken_at_start() if not held or self.ports[n].at == "end"}
+
+    def needed_by(self, output: str) -> set[str]:
+        """Inputs that an output depends on in initialization mode, as the FMU declares."""
+        if self._needs is None:
+            self._needs = initial_dependencies(self.interface)
+        return self._needs.get(output, super().needed_by(output))
+
+    def begin_start(self) -> None:
+        """Instantiate, and enter initialization mode."""
+        self._make_fleet()
+        assert self._fleet is not None
+        self._begun = True
+        self._report(self._fleet.enter(self.environment.active.copy()))
+
+    def settle(self, known: Iterable[str], outputs: Iterable[str]) -> None:
+        """Set the inputs that are known and get some outputs, in initialization mode."""
+        fleet, wanted = self._fleet, set(outputs)
+        assert fleet is not None
+        groups = self._take_known(set(known))
+        self._report(
+            fleet.settle(groups, [self._group(*k) for k in self._output_at if k[0] in wanted])
+        )
+        for port, target, source in self._results_of:
+            if port in wanted:
+                target[...] = source
+
     def _initialize_impl(self) -> None:
+        if not self._begun:
+            self._make_fleet()
+        fleet, active = self._fleet, self.environment.active.copy()
+        assert fleet is not None
+        known = self.known_at_start
+        groups = self._take_known(self.taken_at_start() if known is None else known)
+        messages = self._fresh_messages()
+        finish = fleet.leave if self._begun else fleet.start
+        self._begun = False
+        self._report(finish(active, messages, groups))
+        for target, source in self._results:
+            target[...] = source
+        self._publish_messages()
+
+    def _make_fleet(self) -> None:
         interface, env = self.interface, self.environment
         self._inputs = [p for p in interface.ports if p.is_input and p.kind == "signal"]
         self._messages = [p for p in interface.ports if p.is_input and p.kind == "message"]
@@ -246,6 +296,7 @@ class Fmu(Component):
             self._identities(),
             self.given_parameters["solver"],
             float(self.given_parameters["tolerance"]),
+            float(self.given_parameters["start_time"]),
         )
         limit = float(self.given_parameters["time_limit"])
         self._fleet = (
@@ -254,17 +305,14 @@ class Fmu(Component):
             else Fleet(setup, env.n_members)
         )
         self._sequence = {p.name: np.zeros(env.n_members, np.int64) for p in self._outputs}
-        self._t, self._first = 0.0, True
+        self._t, self._first = setup.start_time, True
+        self._start_time = setup.start_time
         self._skipped = ~env.active
+        self._quantity_at = {(port, name): q for port, name, q in (*read, *written)}
         for port, name, quantity in read:
             columns = self._input_at[port, name]
             self._fleet.inputs[:, columns] = self._start_value(quantity).ravel()
-        self._take_inputs(finite=True)
         self._bind_copies()
-        self._report(self._fleet.start(env.active.copy(), self._fresh_messages()))
-        for target, source in self._results:
-            target[...] = source
-        self._publish_messages()
 
     def _start_settings(self) -> tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]:
         parameters = self.interface.parameters
@@ -300,19 +348,40 @@ class Fmu(Component):
         plain: NDArray[Any] = view
         return plain
 
-    def _take_inputs(self, *, finite: bool = False, late: bool = True) -> None:
-        """Copy inputs into the rows; only those that are known, and not those read at the start."""
+    def _take_known(self, known: Collection[str]) -> list[Group] | None:
+        """Copy into the rows what is known at the start: inputs that may be set; None if all may.
+
+        An input that is not known keeps its start value; the FMU its own, where it gives none.
+        """
+        fleet = self._fleet
+        assert fleet is not None
+        groups, left_out = [], False
+        for (port, name), columns in self._input_at.items():
+            quantity = self._quantity_at[port, name]
+            if port in known:
+                rows = self._view(port, name).reshape(self.n_members, -1)
+                finite = np.isfinite(rows.astype(np.float64)).all(axis=1)
+                fleet.inputs[finite, columns] = rows[finite]
+            elif quantity.start is None and quantity.name not in self._given:
+                left_out = True
+                continue
+            groups.append(self._group(port, name))
+        return groups if left_out else None
+
+    def _group(self, port: str, name: str) -> Group:
+        """One quantity by itself."""
+        quantity = self._quantity_at[port, name]
+        places = self._input_at if (port, name) in self._input_at else self._output_at
+        columns = places[port, name]
+        return Group(quantity.kind, tuple(quantity.references), columns.start, quantity.size)
+
+    def _take_late_inputs(self) -> None:
+        """Copy inputs into the rows, but not those that are read at the start of a step."""
         fleet = self._fleet
         assert fleet is not None
         for (port, name), columns in self._input_at.items():
-            if not late and self.ports[port].at == "start":
-                continue
-            rows = self._view(port, name).reshape(self.n_members, -1)
-            if finite:
-                known = np.isfinite(rows.astype(np.float64)).all(axis=1)
-                fleet.inputs[known, columns] = rows[known]
-            else:
-                fleet.inputs[:, columns] = rows
+            if self.ports[port].at == "end":
+                fleet.inputs[:, columns] = self._view(port, name).reshape(self.n_members, -1)
 
     def _bind_copies(self) -> None:
         """Pairs (target, source) of what is copied before and after each step."""
@@ -323,17 +392,18 @@ class Fmu(Component):
             (fleet.inputs[:, columns], self._view(port, name).reshape(n, -1))
             for (port, name), columns in self._input_at.items()
         ]
-        self._results = [
-            (self._view(port, name).reshape(n, -1), fleet.outputs[:, columns])
+        self._results_of = [
+            (port, self._view(port, name).reshape(n, -1), fleet.outputs[:, columns])
             for (port, name), columns in self._output_at.items()
             if self.ports[port].kind == "signal"
         ]
+        self._results = [(target, source) for _, target, source in self._results_of]
 
     def _step_impl(self, t: float, dt: float) -> None:
         fleet = self._fleet
         assert fleet is not None
         if self._first and self.given_parameters["hold_start_values"]:
-            self._take_inputs(late=False)
+            self._take_late_inputs()
         else:
             for target, source in self._copies:
                 target[...] = source
@@ -347,7 +417,7 @@ class Fmu(Component):
                 self._skipped |= gone
         messages = self._fresh_messages() if self._messages else ()
         failures = fleet.step(self._t, dt, messages, skipped)
-        self._t = t
+        self._t = t + self._start_time
         if failures:
             self._report(failures)
         for target, source in self._results:

@@ -8,7 +8,7 @@ whose instance fails is reported with what the FMU said; the others go on. `Flee
 from __future__ import annotations
 
 import ctypes as ct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -68,6 +68,8 @@ class Setup:
         Type, value references and values set before initialization.
     solver : str
     tolerance : float
+    start_time : float
+        Time of the FMU at t = 0 [s].
     """
 
     file: str
@@ -79,6 +81,7 @@ class Setup:
     each: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...] = ()
     solver: str = "cvode"
     tolerance: float = 1e-10
+    start_time: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -206,49 +209,119 @@ class Fleet:
 
     # ------------------------------------------------------------------ life cycle
 
-    def start(self, active: NDArray[np.bool_], messages: Sequence[Message] = ()) -> Failures:
+    def start(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
         """Instantiate and initialize the active members with what stands in `inputs`.
 
-        Afterwards `outputs` hold the values at t = 0.
+        Only `known` inputs are set, if they are given. Afterwards `outputs` hold the values at the
+        start.
         """
-        failures: Failures = {}
-        for row in np.flatnonzero(active).tolist():
-            try:
-                self._start_one(row, messages)
-            except FmuError as error:
-                self._failed[row] = _STEP
-                failures[row] = str(error)
+
+        def start_one(row: int) -> None:
+            self._enter_one(row)
+            self._leave_one(row, messages, known)
+
+        failures = self._each(np.flatnonzero(active).tolist(), start_one)
         self._active[:] = active
         self._live = self._find_live()
         self._prepare_calls()
         return failures
 
-    def _start_one(self, row: int, messages: Sequence[Message]) -> None:
+    def enter(self, active: NDArray[np.bool_]) -> Failures:
+        """Instantiate the active members, enter initialization mode: the first half of `start`."""
+        self._active[:] = active
+        failures = self._each(np.flatnonzero(active).tolist(), self._enter_one)
+        self._live = self._find_live()
+        return failures
+
+    def settle(self, known: Sequence[Group] | None, wanted: Sequence[Group]) -> Failures:
+        """Set some inputs (all, if absent) and get some outputs, in initialization mode."""
+
+        def settle_one(row: int) -> None:
+            instance = self.instances[row]
+            assert instance is not None
+            self._set_some(instance, row, self.setup.inputs if known is None else known)
+            self._get_some(instance, row, wanted)
+
+        failures = self._each(self._live, settle_one)
+        self._live = self._find_live()
+        return failures
+
+    def leave(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
+        """Set `known` inputs and leave initialization mode: the second half of `start`."""
+        self._active[:] &= active
+        self._live = self._find_live()
+        failures = self._each(self._live, lambda row: self._leave_one(row, messages, known))
+        self._live = self._find_live()
+        self._prepare_calls()
+        return failures
+
+    def _each(self, rows: Sequence[int], action: Callable[[int], None]) -> Failures:
+        failures: Failures = {}
+        for row in rows:
+            try:
+                action(row)
+            except FmuError as error:
+                self._failed[row] = _STEP
+                failures[row] = str(error)
+        return failures
+
+    def _enter_one(self, row: int) -> None:
         instance = self.instances[row] = Instance(self.library, f"{self.setup.name}_{row}")
         for kind, vr, values in self.setup.starts:
             instance.set(kind, references(vr), values)
         for kind, vr, values in self.setup.each:
             instance.set(kind, references(vr), values[row])
-        instance.begin(0.0)
-        self._set_all(instance, row)
+        instance.begin(self.setup.start_time)
+
+    def _leave_one(
+        self, row: int, messages: Sequence[Message], known: Sequence[Group] | None
+    ) -> None:
+        instance = self.instances[row]
+        assert instance is not None
+        self._set_some(instance, row, self.setup.inputs if known is None else known)
         for message in messages:
             message.send(row, instance)
         instance.finish()
         if self.setup.kind != CO_SIMULATION:
             self._integrators[row] = Integrator(
-                instance, self.archive, 0.0, self.setup.solver, self.setup.tolerance
+                instance,
+                self.archive,
+                self.setup.start_time,
+                self.setup.solver,
+                self.setup.tolerance,
             )
         self._get_all(instance, row)
 
-    def _set_all(self, instance: Instance, row: int) -> None:
-        for group in self.setup.inputs:
+    def _set_some(self, instance: Instance, row: int, groups: Sequence[Group]) -> None:
+        for group in groups:
             values = self.inputs[row, group.start : group.start + group.size]
-            instance.set(group.kind, self._references[group], values)
+            instance.set(group.kind, self._referred(group), values)
+
+    def _get_some(self, instance: Instance, row: int, groups: Sequence[Group]) -> None:
+        for group in groups:
+            values = instance.get(group.kind, self._referred(group), group.size)
+            self.outputs[row, group.start : group.start + group.size] = values
+
+    def _referred(self, group: Group) -> Any:
+        if group not in self._references:
+            self._references[group] = references(group.references)
+        return self._references[group]
+
+    def _set_all(self, instance: Instance, row: int) -> None:
+        self._set_some(instance, row, self.setup.inputs)
 
     def _get_all(self, instance: Instance, row: int) -> None:
-        for group in self.setup.outputs:
-            values = instance.get(group.kind, self._references[group], group.size)
-            self.outputs[row, group.start : group.start + group.size] = values
+        self._get_some(instance, row, self.setup.outputs)
         if not np.isfinite(self.outputs[row]).all():
             raise FmuError("an output is not finite")
 

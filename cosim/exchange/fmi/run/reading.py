@@ -27,6 +27,7 @@ INTEGER = (
     *("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16"),
     *("Int32", "UInt32", "Int64", "UInt64"),
 )
+_KNOWN = ("input", "parameter", "structuralParameter", "independent")
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\d+)*)\]\Z")
 
 
@@ -272,6 +273,49 @@ def _starts(members: Sequence[Any]) -> list[float] | None:
         else:
             words += [str(x) for x in np.asarray(text).ravel()]
     return [1.0 if w == "true" else 0.0 if w == "false" else float(w) for w in words]
+
+
+# --------------------------------------------------------------------------------- dependencies
+
+
+def initial_dependencies(interface: Interface) -> dict[str, set[str]]:
+    """Input ports that each output port depends on in initialization mode.
+
+    As InitialUnknowns declare; where these do not list an output, as Outputs do, if it depends on
+    inputs alone. What is not declared depends on all inputs; a start that is exact on none.
+    """
+    description = interface.archive.description
+    inputs: dict[str, str] = {}
+    outputs: dict[str, list[str]] = {}
+    for port in interface.ports:
+        names = [n for q, _ in port.fields.values() for n in {q.name, *q.scalars()}]
+        if port.is_input and port.kind == "signal":
+            inputs |= dict.fromkeys(names, port.name)
+        elif not port.is_input:
+            outputs[port.name] = names
+    everything = set(inputs.values())
+    at_start = {u.variable.name: u for u in description.initialUnknowns}
+    later = {u.variable.name: u for u in description.outputs}
+    variables = {v.name: v for v in description.modelVariables}
+
+    def needs(name: str) -> set[str]:
+        known = at_start.get(name) or later.get(name)
+        if name not in at_start and variables[name].initial == "exact":
+            return set()
+        if known is None or known.dependencies is None:
+            return everything
+        found = set()
+        for variable in known.dependencies:
+            if variable.name in inputs:
+                found.add(inputs[variable.name])
+            elif name not in at_start and variable.causality not in _KNOWN:
+                return everything  # a state, whose own start is not declared
+        return found
+
+    return {
+        port: set().union(*(needs(n) for n in names if n in variables))
+        for port, names in outputs.items()
+    }
 
 
 # --------------------------------------------------------------------------------- ports

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
-from terrafix.cosim.exchange.fmi.run.fleet import Failures, Fleet, Message, Setup
+from terrafix.cosim.exchange.fmi.run.fleet import Failures, Fleet, Group, Message, Setup
 
 _HEADER = struct.Struct("<Q")
 FIRST_LIMIT = 60.0  # imports and unpacking take their time [s]
@@ -153,9 +153,31 @@ class RemoteFleet:
         self._worker = Worker("terrafix.cosim.exchange.fmi.run.remote", f"the FMU '{setup.file}'")
         self._worker.call("make", setup, n_members, limit=FIRST_LIMIT)
 
-    def start(self, active: NDArray[np.bool_], messages: Sequence[Message] = ()) -> Failures:
+    def start(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
         """As `Fleet.start`."""
-        return self._exchange("start", active, messages)
+        return self._exchange("start", active, messages, known)
+
+    def enter(self, active: NDArray[np.bool_]) -> Failures:
+        """As `Fleet.enter`."""
+        return self._exchange("enter", active)
+
+    def settle(self, known: Sequence[Group] | None, wanted: Sequence[Group]) -> Failures:
+        """As `Fleet.settle`."""
+        return self._exchange("settle", known, wanted)
+
+    def leave(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
+        """As `Fleet.leave`."""
+        return self._exchange("leave", active, messages, known)
 
     def step(
         self,
@@ -206,7 +228,7 @@ def main() -> None:
     serve(
         {
             "make": make,
-            "start": exchange("start"),
+            **{name: exchange(name) for name in ("start", "enter", "settle", "leave")},
             "step": exchange("step"),
             "save": lambda: fleet[0].save(),
             "restore": lambda saved: fleet[0].restore(saved),
