@@ -127,7 +127,8 @@ def check(system: Flattened, *, duration: Fraction | None = None, outside: bool 
     if problems:
         raise SystemCheckError(system.name, problems)
     start = starting_order(flat, order)
-    return Plan(flat, order, base, grid, [*_notes(flat), *_starting_notes(start)], start)
+    notes = [*system.notes, *_notes(flat), *_starting_notes(start)]
+    return Plan(flat, order, base, grid, notes, start)
 
 
 def _component_problems(

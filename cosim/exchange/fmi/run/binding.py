@@ -305,6 +305,12 @@ class Instance:
         sizes = () if self._version == 2 else (ct.c_size_t(len(flat)),)
         self.call(f"Set{name}", vr, ct.c_size_t(len(vr)), array, *sizes)
 
+    def set_text(self, reference: int, text: str) -> None:
+        """Set a variable of text."""
+        array = (ct.c_char_p * 1)(text.encode())
+        sizes = () if self._version == 2 else (ct.c_size_t(1),)
+        self.call("SetString", references([reference]), ct.c_size_t(1), array, *sizes)
+
     # ------------------------------------------------------------------ co-simulation
 
     def step(self, t: float, h: float) -> None:

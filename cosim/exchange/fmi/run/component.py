@@ -174,12 +174,20 @@ class Fmu(Settling):
     def _read_starts(self) -> dict[str, FloatArray]:
         """Values of ``start``, converted to the units of the variables."""
         known = self.settable()
-        values = {}
+        values: dict[str, FloatArray] = {}
+        self._texts: list[tuple[int, str]] = []
         for name, value in self.given_parameters["start"].items():
+            if name in self.interface.texts:
+                if not isinstance(value, str):
+                    raise ConfigurationError(
+                        f"'{self.name}.start.{name}' is text, not {value!r}\n  write \"{value}\""
+                    )
+                self._texts.append((self.interface.texts[name], value))
+                continue
             if name not in known:
                 raise ConfigurationError(
                     f"'{self.name}.start': the FMU has no parameter or input '{name}'\n"
-                    f"  {nearest(name, known, what='it has')}"
+                    f"  {nearest(name, [*known, *self.interface.texts], what='it has')}"
                 )
             quantity = known[name]
             # nobody says what a foreign array's elements have in common
@@ -190,10 +198,13 @@ class Fmu(Settling):
         return values
 
     def settable(self) -> dict[str, Quantity]:
-        """Parameters and inputs that ``start`` may name."""
-        ports = self.interface.ports
-        inputs = {q.name: q for p in ports if p.is_input for q, _ in p.fields.values()}
-        return self.interface.parameters | inputs
+        """Parameters, inputs, and outputs with a start value of their own: what ``start`` names."""
+        return self.interface.parameters | {
+            q.name: q
+            for port in self.interface.ports
+            for q, _ in port.fields.values()
+            if port.is_input or (q.initial in ("exact", "approx") and q.variability != "constant")
+        }
 
     def given_starts(self) -> dict[str, FloatArray]:
         """Values of ``start`` in the units of the variables."""
@@ -297,6 +308,7 @@ class Fmu(Settling):
             self.given_parameters["solver"],
             float(self.given_parameters["tolerance"]),
             float(self.given_parameters["start_time"]),
+            tuple(self._texts),
         )
         limit = float(self.given_parameters["time_limit"])
         self._fleet = (
@@ -315,15 +327,15 @@ class Fmu(Settling):
         self._bind_copies()
 
     def _start_settings(self) -> tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]:
-        parameters = self.interface.parameters
+        known = self.settable()
         return tuple(
             (
-                parameters[name].kind,
-                tuple(parameters[name].references),
+                known[name].kind,
+                tuple(known[name].references),
                 tuple(float(v) for v in value.ravel()),
             )
             for name, value in self._given.items()
-            if name in parameters
+            if known[name].causality != "input"
         )
 
     def _identities(self) -> tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]:

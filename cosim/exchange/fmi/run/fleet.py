@@ -70,6 +70,8 @@ class Setup:
     tolerance : float
     start_time : float
         Time of the FMU at t = 0 [s].
+    texts : tuple of (int, str)
+        Value reference and text, set before initialization.
     """
 
     file: str
@@ -82,6 +84,7 @@ class Setup:
     solver: str = "cvode"
     tolerance: float = 1e-10
     start_time: float = 0.0
+    texts: tuple[tuple[int, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -279,6 +282,8 @@ class Fleet:
         instance = self.instances[row] = Instance(self.library, f"{self.setup.name}_{row}")
         for kind, vr, values in self.setup.starts:
             instance.set(kind, references(vr), values)
+        for reference, text in self.setup.texts:
+            instance.set_text(reference, text)
         for kind, vr, values in self.setup.each:
             instance.set(kind, references(vr), values[row])
         instance.begin(self.setup.start_time)

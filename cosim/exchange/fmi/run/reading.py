@@ -27,6 +27,7 @@ INTEGER = (
     *("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16"),
     *("Int32", "UInt32", "Int64", "UInt64"),
 )
+_SETTABLE = ("exact", "approx")
 _KNOWN = ("input", "parameter", "structuralParameter", "independent")
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\d+)*)\]\Z")
 
@@ -50,6 +51,10 @@ class Quantity:
     doc : str
     base : int
         Index of the first element, in names.
+    initial : str or None
+        How the start is found, as far as the description says.
+    items : dict of str to int
+        Of an enumeration, by name.
     """
 
     name: str
@@ -62,6 +67,8 @@ class Quantity:
     variability: str = "continuous"
     doc: str = ""
     base: int = 1
+    initial: str | None = None
+    items: dict[str, int] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -129,6 +136,8 @@ class Interface:
         Whether its state can be got and set, and written as bytes.
     own : bool
         Whether terrafix wrote it.
+    texts : dict of str to int
+        Value references of texts that may be set before initialization, by name.
     """
 
     archive: Archive
@@ -139,6 +148,7 @@ class Interface:
     state: bool
     serialize: bool
     own: bool
+    texts: dict[str, int] = field(default_factory=dict)
 
 
 def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True) -> Interface:
@@ -179,7 +189,19 @@ def read_interface(archive: Archive, kind: str = "auto", *, arrays: bool = True)
         bool(interface.canGetAndSetFMUstate),
         bool(interface.canGetAndSetFMUstate and interface.canSerializeFMUstate),
         own=archive.annotation is not None,
+        texts=_texts(description),
     )
+
+
+def _texts(description: Any) -> dict[str, int]:
+    return {
+        v.name: int(v.valueReference)
+        for v in description.modelVariables
+        if v.type == "String"
+        and not v.dimensions
+        and v.variability != "constant"
+        and (v.causality in ("input", "parameter") or v.initial in _SETTABLE)
+    }
 
 
 # --------------------------------------------------------------------------------- variables
@@ -246,7 +268,15 @@ def _quantity(name: str, shape: tuple[int, ...], members: Sequence[Any]) -> Quan
         first.causality,
         first.variability or "continuous",
         " ".join((first.description or "").split()),
+        initial=first.initial,
+        items=_items(first),
     )
+
+
+def _items(variable: Any) -> dict[str, int]:
+    """Items of an enumeration by name."""
+    declared = getattr(variable.declaredType, "items", None)
+    return {str(item.name): int(item.value) for item in declared or ()}
 
 
 def _unit(variable: Any) -> str:

@@ -7,7 +7,7 @@ import pytest
 from plain_fmus import V, plain_fmu
 
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import StepError
+from terrafix.cosim.basics.errors import ConfigurationError, StepError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Input, Output
 from terrafix.cosim.engine.simulation import Simulation
@@ -235,3 +235,34 @@ def test_whole_numbers_start_from_their_source_or_their_start_value(
         system.connect(f"source.{name}_out", f"a_sink.{name}", delay=delay)
     found = at(system, ["0", "0.3"], *(f"a_sink.{n}_first" for n in "ibe"))
     assert found[0, :, 0].tolist() == expected
+
+
+# ------------------------------------------------------------------ text, and another start time
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_text_and_exact_outputs_are_set_before_the_start(tmp_path, isolate):
+    """The FMU counts the letters of its word; its clock stands at 5 s at t = 0."""
+    file = plain_fmu(
+        tmp_path / "letters.fmu",
+        [
+            V("word", "parameter", "no", "String"),
+            V("level", "output", 4.0, initial="exact"),
+            V("letters", "output", kind="Integer"),
+            V("time", "output"),
+        ],
+        begin="time = t; letters = (int)strlen(word);",
+        step="time = t + h;",
+    )
+    system = System("text")
+    start = {"word": "hello", "level": 8.0}
+    system.add(Fmu(file=file, rate=RATE, start=start, start_time=5.0, isolate=isolate), "a")
+    found = at(system, ["0", "0.1"], "a.letters", "a.level", "a.time")
+    assert found[:, :, 0] == pytest.approx(np.array([[5, 8, 5.0], [5, 8, 5.1]]))
+
+
+def test_text_that_is_no_text(tmp_path):
+    file = plain_fmu(tmp_path / "t.fmu", [V("word", "parameter", "no", "String")])
+    system = System("text")
+    with pytest.raises(ConfigurationError, match=r"'a.start.word' is text, not 3"):
+        system.add(Fmu(file=file, rate=RATE, start={"word": 3}), "a")
