@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -57,6 +58,20 @@ class Value:
         return replace(self, steps=steps, unit=self.unit if keep_unit else None)
 
 
+def exact(text: str, where: str) -> Fraction:
+    """A finite number of a package, exact.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is none; `where` says whose it is.
+    """
+    try:
+        return Fraction(text.strip())
+    except (ValueError, ZeroDivisionError):
+        raise ConfigurationError(f"{where} is '{text}', which is no number") from None
+
+
 def transformation(parent: ET.Element, where: str) -> Transformation:
     """The transformation that a connection or a mapping entry holds.
 
@@ -68,9 +83,11 @@ def transformation(parent: ET.Element, where: str) -> Transformation:
     for child in parent:
         kind = child.tag.rpartition("}")[2]
         if kind == "LinearTransformation":
-            return Transformation(
-                float(child.get("factor") or 1.0), float(child.get("offset") or 0.0)
+            factor, offset = (
+                float(exact(child.get(name) or default, f"{where}: {name} of its {kind}"))
+                for name, default in (("factor", "1"), ("offset", "0"))
             )
+            return Transformation(factor, offset)
         if kind in ("BooleanMappingTransformation", "IntegerMappingTransformation",
                     "EnumerationMappingTransformation"):  # fmt: skip
             entries = [e for e in child if e.tag.rpartition("}")[2] == "MapEntry"]

@@ -8,12 +8,15 @@ what it contains, and what is set at a connector of a system goes to all that ar
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 
 from terrafix.cosim.basics.clock import Rate, seconds
@@ -29,6 +32,7 @@ from terrafix.cosim.exchange.ssp.names import OSP, OWN, SSD, SSM, SSV, tag
 from terrafix.cosim.exchange.ssp.parameters import (
     Transformation,
     Value,
+    exact,
     mapped,
     read_set,
     starts_of,
@@ -39,6 +43,8 @@ from terrafix.cosim.files.writing import system_text
 from terrafix.cosim.system.system import System
 
 STRUCTURE = "SystemStructure.ssd"
+MOST_WITHIN = 10
+_SYSTEM_TYPES = ("application/x-ssp-package", "application/x-ssp-definition")
 VERSIONS = ("1.", "2.0")
 _KINDS = {"any": "auto", "CoSimulation": CO_SIMULATION, "ModelExchange": MODEL_EXCHANGE}
 _SOURCES = {True: ("input", "parameter", "inout"), False: ("output", "calculatedParameter")}
@@ -67,7 +73,7 @@ class _Part:
     """A component of the package."""
 
     name: str
-    source: str
+    source: Path
     kind: str = "auto"
     starts: dict[str, Value] = field(default_factory=dict)
     rate: Rate | None = None
@@ -219,6 +225,7 @@ class _Reader:
         self.file, self.folder, self.root, self.top = file, folder, root, top
         self._rates = rates
         self._notes: list[str] = []
+        self._within: list[str] = []
 
     def note_undeclared(self, name: str, missing: Sequence[str]) -> None:
         """Keep in mind that a document uses prefixes that it does not declare."""
@@ -297,7 +304,7 @@ class _Reader:
                 if isinstance(element.tag, str) and element.tag.rpartition("}")[2] == name:
                     text = element.get("baseStepSize") or element.get("stepSize")
                     if text:
-                        return Fraction(text).limit_denominator(10**9)
+                        return exact(text, f"'{self.file}': {name}").limit_denominator(10**9)
         return None
 
     def _duration(self) -> Fraction | None:
@@ -312,7 +319,9 @@ class _Reader:
     def _experiment(self, name: str) -> Fraction | None:
         experiment = self.root.find(tag(SSD, "DefaultExperiment"))
         text = None if experiment is None else experiment.get(name)
-        return None if text is None else Fraction(text).limit_denominator(10**9)
+        if text is None:
+            return None
+        return exact(text, f"'{self.file}': {name} of its experiment").limit_denominator(10**9)
 
     def _collect(self, into: _Structure) -> None:
         """Gather components and connections, following systems within down to components."""
@@ -336,8 +345,9 @@ class _Reader:
         for (owner, name), kind in into.kinds.items():
             if owner or kind != "output" or ("", name) not in incoming:
                 continue
-            origin = incoming["", name].source
-            while origin[0] not in into.parts and origin in incoming:
+            origin, seen = incoming["", name].source, set[End]()
+            while origin[0] not in into.parts and origin in incoming and origin not in seen:
+                seen.add(origin)
                 origin = incoming[origin].source
             if origin[0] in into.parts:
                 into.outputs[name] = origin
@@ -369,7 +379,10 @@ class _Reader:
                     "  rename one of them"
                 )
             full = self._free(f"{prefix}{name}", into)
-            if kind == "Component":
+            if kind == "Component" and element.get("type") in _SYSTEM_TYPES:
+                names[name] = f"system {full}"
+                self._gather_within(element, names[name], f"{full}_", into)
+            elif kind == "Component":
                 names[name] = full
                 into.parts[full] = self._part(full, element)
             elif kind == "System":
@@ -384,6 +397,39 @@ class _Reader:
         for connection in _children(system, "Connections", "Connection"):
             into.joints.append(self._joint(connection, key, names, kinds, into))
         for name, value in self._values(system).items():
+            self._set(into, key, name, value)
+
+    def _gather_within(self, element: ET.Element, key: str, prefix: str, into: _Structure) -> None:
+        """Gather the system of another package or description, as if it stood here.
+
+        What is bound to the component overrules what is bound to that system.
+        """
+        given = self._values(element)
+        source, folder = self._resource(element.get("source") or ""), self.folder
+        if len(self._within) >= MOST_WITHIN:
+            raise ConfigurationError(
+                f"'{self.file}': more than {MOST_WITHIN} packages lie within each other"
+            )
+        document = source
+        if element.get("type") == _SYSTEM_TYPES[0]:
+            self.folder = folder / f"{prefix}package"
+            unpack(source, self.folder, "SSP package")
+            document = self.folder / STRUCTURE
+        try:
+            if not document.is_file():
+                raise ConfigurationError(f"'{self.file}': '{source.name}' has no {STRUCTURE}")
+            root, missing = read_document(document, self.file)
+            self.note_undeclared(document.name, missing)
+            _check_version(self.file, document.name, root)
+            system = root.find(tag(SSD, "System"))
+            if system is None:
+                raise ConfigurationError(f"'{self.file}': '{source.name}' describes no system")
+            self._within.append(key)
+            self._gather(system, key, prefix, into)
+            self._within.pop()
+        finally:
+            self.folder = folder
+        for name, value in given.items():
             self._set(into, key, name, value)
 
     @staticmethod
@@ -424,15 +470,23 @@ class _Reader:
         step = transformation(connection, f"'{self.file}': the connection to '{ends[1][1]}'")
         return _Joint(ends[0], ends[1], step, keep)
 
-    def _set(self, into: _Structure, owner: str, name: str, value: Value) -> None:
+    def _set(
+        self,
+        into: _Structure,
+        owner: str,
+        name: str,
+        value: Value,
+        passed: frozenset[End] = frozenset(),
+    ) -> None:
         """Set what a hierarchical name means; what is set later overrules what was set before."""
+        readers = [j for j in into.joints if j.source == (owner, name)]
         if owner in into.parts:
             into.parts[owner].starts[name] = value
-        elif (owner, name) in into.kinds:
-            for joint in into.joints:
-                if joint.source == (owner, name):
+        elif (owner, name) in into.kinds or readers:
+            for joint in readers:
+                if joint.target not in passed:
                     there = value.through(joint.step, keep_unit=joint.keep_unit)
-                    self._set(into, *joint.target, there)
+                    self._set(into, *joint.target, there, passed | {joint.target})
         else:
             elements = into.elements.get(owner, {})
             inside = [e for e in elements if name.startswith(f"{e}.")]
@@ -445,7 +499,8 @@ class _Reader:
         source = element.get("source") or ""
         if kind != "application/x-fmu-sharedlibrary":
             raise ConfigurationError(
-                f"'{self.file}': component '{name}' is of type {kind}; terrafix reads FMUs"
+                f"'{self.file}': component '{name}' is of type {kind}; terrafix reads FMUs "
+                "and packages of them"
             )
         wanted = element.get("implementation", "any")
         if wanted not in _KINDS:
@@ -453,7 +508,7 @@ class _Reader:
                 f"'{self.file}': component '{name}' wants its FMU run by {wanted}; terrafix runs "
                 "CoSimulation and ModelExchange"
             )
-        part = _Part(name, source, _KINDS[wanted])
+        part = _Part(name, self._resource(source), _KINDS[wanted])
         part.starts = self._values(element)
         rate = next(element.iter(tag(OWN, "Rate")), None)
         if rate is not None:
@@ -466,7 +521,8 @@ class _Reader:
         else:
             hint = next(element.iter(tag(OSP, "StepSizeHint")), None)
             if hint is not None and hint.get("value"):
-                part.rate = Rate(Fraction(str(hint.get("value"))).limit_denominator(10**9))
+                step = exact(str(hint.get("value")), f"'{self.file}': StepSizeHint of '{name}'")
+                part.rate = Rate(step.limit_denominator(10**9))
         return part
 
     def _values(self, element: ET.Element) -> dict[str, Value]:
@@ -512,6 +568,8 @@ class _Reader:
 
     def _resource(self, source: str) -> Path:
         path = (self.folder / source.removeprefix("file:")).resolve()
+        if not path.is_file():
+            path = (self.folder / unquote(source.removeprefix("file:"))).resolve()
         if not path.is_relative_to(self.folder.resolve()) or not path.is_file():
             raise ConfigurationError(f"'{self.file}' names '{source}', which is not in it")
         return path
@@ -521,13 +579,13 @@ class _Reader:
     def _fmu(self, part: _Part, base: Fraction | None, *, arrays: bool) -> Fmu:
         start = self._experiment("startTime") or Fraction(0)
         made = Fmu(
-            file=self._resource(part.source),
+            file=part.source,
             arrays=arrays,
             kind=part.kind,
             start_time=float(start),
         )
         made.name = part.name
-        try:
+        with self._telling(part):
             made.prepare()
             given = self._rates.get(part.name) or part.rate
             rate = given or (Rate(base) if base is not None else None) or made.rate
@@ -539,19 +597,26 @@ class _Reader:
                 )
             made.start = starts_of(made, part.starts)
             made.prepare()
-        except TerrafixError as error:
-            raise type(error)(f"'{self.file}': '{part.name}': {error}") from error
-        finally:
-            made.name = ""
+        made.name = ""
         return made
+
+    @contextmanager
+    def _telling(self, part: _Part) -> Iterator[None]:
+        """Say of which file and component an error is, and not where it was unpacked."""
+        try:
+            yield
+        except TerrafixError as error:
+            text = str(error).replace(f"{self.folder.resolve()}{os.sep}", "")
+            raise type(error)(f"'{self.file}': '{part.name}': {text}") from error
 
     def _scalar_parts(self, structure: _Structure) -> set[str]:
         """Components of which single elements of an array are connected."""
         found: set[str] = set()
         interfaces: dict[str, Fmu] = {}
         for part in structure.parts.values():
-            interfaces[part.name] = Fmu(file=self._resource(part.source), kind=part.kind)
-            interfaces[part.name].prepare()
+            interfaces[part.name] = Fmu(file=part.source, kind=part.kind)
+            with self._telling(part):
+                interfaces[part.name].prepare()
         for ends, whole in _grouped(structure.links, interfaces).items():
             if not whole:
                 found |= {ends[0][0], ends[1][0]}

@@ -349,3 +349,45 @@ def test_a_step_size_is_asked_for_by_name(tmp_path, fmus, capsys):
     target = tmp_path / "x.toml"
     assert run("ssp", "import", file, "--rate", "0.1s", "-o", target)[0] == 0
     assert "0.1" in target.read_text()
+
+
+def test_a_package_within_a_package(tmp_path, fmus):
+    """What is bound to the component overrules the inner package's own: k 7, not 3."""
+    inner = system(
+        part("a", inside=bindings(bound(k="2"))),
+        link("a.y", "out"),
+        link("in", "a.u"),
+        before=connectors(**{"in": "input", "out": "output"}) + bindings(bound(a__k="3")),
+    )
+    held = packaged(tmp_path / "inner.ssp", fmus, inner).read_bytes()
+    component = (
+        '<ssd:Component name="B" type="application/x-ssp-package" source="in%20ner.ssp">'
+        + bindings(bound(a__k="7"))
+        + "</ssd:Component>"
+    )
+    top = system(component + part("c"), link("c.y", "B.in"), link("B.out", "c.u"))
+    file = packaged(tmp_path / "x.ssp", fmus, top, **{"in ner.ssp": held})
+    made = read_ssp(file)
+    assert sorted(map(str, made.connections)) == ["B_a.y -> c.u", "c.y -> B_a.u"]
+    file = packaged(tmp_path / "y.ssp", fmus, system(component), **{"in ner.ssp": held})
+    assert values(file, "B_a.y") == [7.0]
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ({"experiment": 'startTime="0" stopTime="soon"'}, "stopTime of its experiment is 'soon'"),
+        ({"experiment": 'startTime="5" stopTime="2"'}, "stops at 2 s and starts at 5 s"),
+        ({"step": STEP.replace('"0.1"', '"quick"')}, "FixedStepAlgorithm is 'quick', which is no"),
+    ],
+)
+def test_numbers_that_are_none(tmp_path, fmus, written, message):
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a")), **written)
+    with pytest.raises(ConfigurationError, match=message):
+        read_ssp(file)
+
+
+def test_what_is_wrong_with_an_fmu_names_the_package_and_not_a_temporary_folder(tmp_path):
+    file = packaged(tmp_path / "x.ssp", {"k": b"no archive"}, system(part("a")))
+    with pytest.raises(ConfigurationError, match=r"x.ssp': 'a': 'k.fmu' is no FMU"):
+        read_ssp(file)
