@@ -79,6 +79,10 @@ def starting_order(flat: FlatSystem, order: Sequence[str]) -> Start:
         if not connection.delay and name in wanted.get(owner, ()):
             start.taken[owner].append(connection)
     place = {path: k for k, path in enumerate(order)}
+    links = [(flat.owner(c.source), p) for p, taken in start.taken.items() for c in taken]
+    if all(place[source] < place[target] for source, target in links):
+        start.stages = list(order)
+        return start
     after: dict[str, set[str]] = {path: set() for path in order}
     for a, b in _waiting(flat, start, place):
         after[a].add(b)
