@@ -68,6 +68,24 @@ def test_it_is_what_fmpy_has(folder):
     assert found[:, 0, 0].tolist() == rows["y"].tolist() == [1.0, 1.1]
 
 
+def test_dependencies_that_are_declared(tmp_path):
+    """By InitialUnknowns, by Outputs without these, on all inputs where neither says anything."""
+    variables = [
+        V("u", "input", 0.0),
+        V("v", "input", 0.0),
+        V("one", "output", depends="v"),
+        V("none", "output", depends=""),
+        V("all", "output"),
+        V("held", "output", 1.0, initial="exact"),
+    ]
+    expected = {"one": {"v"}, "none": set(), "all": {"u", "v"}, "held": set()}
+    for structure in (True, False):
+        file = plain_fmu(tmp_path / "d.fmu", variables, structure=structure)
+        fmu = Fmu(file=file, rate=RATE)
+        System("alone").add(fmu, "a")
+        assert {name: fmu.needed_by(name) for name in expected} == expected
+
+
 def test_isolated_and_in_a_loop_component_too(folder):
     found = at(chain(folder, isolate=True), ["0", "0.1"], "a_q.y")
     assert found[:, 0, 0] == pytest.approx([1.0, 1.1], abs=1e-15)
