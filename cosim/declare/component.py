@@ -425,8 +425,12 @@ class Component(Shown):
 
         They are where 0 is one of the activations and the component does something then.
         """
-        acts = type(self)._initialize_impl is not Component._initialize_impl
-        return acts and self.publishes_at_start
+        return self.acts_at_start() and self.publishes_at_start
+
+    @classmethod
+    def acts_at_start(cls) -> bool:
+        """Whether it does something at t = 0: whether a class provides `_initialize_impl`."""
+        return cls._initialize_impl is not Component._initialize_impl
 
     def scheduled(self, t: float) -> float:
         """The time of this activation as it was listed, before it was snapped to a tick at `t` [s].

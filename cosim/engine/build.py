@@ -46,6 +46,8 @@ class Wiring:
         stepped; by producer path: what collects a value it has just published.
     clear : dict of str to list of callables
         By consumer path: windows to empty once it has stepped.
+    copies : dict of str to callable
+        By input: what fills its private copy, without delay.
     keepers : dict of str to object
         Everything with `get_state`/`set_state`, by a stable name: part of checkpoints.
     """
@@ -57,6 +59,7 @@ class Wiring:
         default_factory=lambda: defaultdict(list)
     )
     clear: dict[str, list[Callable[[], None]]] = field(default_factory=lambda: defaultdict(list))
+    copies: dict[str, Transfer] = field(default_factory=dict)
     keepers: dict[str, Any] = field(default_factory=dict)
     readers: dict[str, MessageReader] = field(default_factory=dict)
 
@@ -186,11 +189,13 @@ def _connect(
         slot = _keep(wiring, connection, private)
     elif port.at == "start" and not in_place:
         private = type(slot)(source_port.fields, len(slot.data))
-        wiring.latch[path].append(_copy(slot, private, factor))
+        copy = wiring.copies[connection.target] = _copy(slot, private, factor)
+        wiring.latch[path].append(copy)
         slot = _keep(wiring, connection, private)
     elif factor is not None:
         private = type(slot)(source_port.fields, len(slot.data))
-        wiring.before[path].append(_copy(slot, private, factor))
+        copy = wiring.copies[connection.target] = _copy(slot, private, factor)
+        wiring.before[path].append(copy)
         slot = _keep(wiring, connection, private)
     if isinstance(slot, MessageSlot):
         _read_message(wiring, connection, component, name, port, slot)

@@ -24,8 +24,8 @@ from terrafix.cosim.basics.errors import (
 from terrafix.cosim.engine.agenda import Agenda
 from terrafix.cosim.engine.build import bind_components, connect_ports
 from terrafix.cosim.engine.program import Entry, Program, stretch_of
+from terrafix.cosim.engine.starting import Starter
 from terrafix.cosim.kernels.symbolic import NOT_FINITE, SymbolicComponent
-from terrafix.cosim.memory.links import DelayLine
 from terrafix.cosim.system.check import Plan
 from terrafix.cosim.system.dispersion import apply_all
 
@@ -143,23 +143,11 @@ class Master:
     # ------------------------------------------------------------------ running
 
     def initialize(self, *, observe: bool = True) -> None:
-        """Publish everything at t = 0, in the order of end-reads.
+        """Publish everything at t = 0, in the order that the plan has for it.
 
-        Nothing delayed has arrived then, and start-reads have nothing to hold: these inputs are
-        NaN, whatever the order. `observe` is false where a saved state replaces all of it.
+        `observe` is false where a saved state replaces all of it.
         """
-        for entry in self.entries.values():
-            try:
-                for transfer in entry.before:
-                    if not isinstance(transfer, DelayLine):
-                        transfer(0)
-                entry.component.initialize()
-            except Exception as error:
-                raise self._component_error(entry.path, error) from error
-            for collect in entry.after:
-                collect(0, 0.0)
-            for clear in entry.clear:
-                clear()
+        Starter(self.plan, self.entries, self.wiring, self.active, self._component_error).start()
         for path in self.entries:
             for transfer in self.wiring.latch.get(path, ()):
                 transfer(0)

@@ -24,8 +24,9 @@ from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.show.tables import Block, Shown
 from terrafix.cosim.system.dispersion import overridden
-from terrafix.cosim.system.flat import FlatSystem, Flattened, Record
+from terrafix.cosim.system.flat import Connection, FlatSystem, Flattened, Record
 from terrafix.cosim.system.order import stepping_order
+from terrafix.cosim.system.start import Start, starting_order
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,6 +45,8 @@ class Plan(Shown):
         recorder moves nobody.
     notes : list of str
         What is allowed but worth knowing.
+    start : Start
+        How components are initialized.
     """
 
     flat: FlatSystem
@@ -51,6 +54,7 @@ class Plan(Shown):
     base: Fraction
     grid: Fraction
     notes: list[str]
+    start: Start
 
     def content(self) -> dict[str, Any]:
         """Plain types for JSON, components in stepping order."""
@@ -122,7 +126,9 @@ def check(system: Flattened, *, duration: Fraction | None = None, outside: bool 
     attempt(find_order)
     if problems:
         raise SystemCheckError(system.name, problems)
-    return Plan(flat, order, base, grid, list(_notes(flat)))
+    start = starting_order(flat, order)
+    notes = [*system.notes, *_notes(flat), *_starting_notes(start)]
+    return Plan(flat, order, base, grid, notes, start)
 
 
 def _component_problems(
@@ -304,6 +310,23 @@ def record_rate(flat: FlatSystem, record: Record) -> Rate:
 def _feeding(flat: FlatSystem, path: str) -> str:
     source = next((c.source for c in flat.connections if c.target == path), None)
     return f"record the output that feeds it: '{source}'" if source else "only outputs are recorded"
+
+
+def _starting_notes(start: Start) -> Iterator[str]:
+    for loop in start.loops:
+        yield (
+            f"at t = 0, {_listed(loop)} depend on each other: they are repeated from start values "
+            "until they stand still"
+        )
+    if start.dropped:
+        yield (
+            f"at t = 0, {_listed(start.dropped)} would close a loop through what is initialized "
+            "once: the start value of its input stays"
+        )
+
+
+def _listed(links: list[Connection]) -> str:
+    return ", ".join(f"'{link}'" for link in links)
 
 
 def _notes(flat: FlatSystem) -> Iterator[str]:

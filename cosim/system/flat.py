@@ -68,6 +68,8 @@ class Flattened(Protocol):
     name: str
     exposed: dict[str, str]
     """Paths of ports, by the names they are exposed under."""
+    notes: list[str]
+    """What whoever read it found worth knowing."""
 
     def resolve(self, path: str) -> tuple[str, Port[object]]:
         """Follow exposed ports down to (path of the component's port, port)."""

@@ -86,6 +86,7 @@ class System(Shown):
         self.exposed: dict[str, str] = {}
         self.records: list[Record] = []
         self.dispersions: list[Dispersion] = []
+        self.notes: list[str] = []
         self._contained = False
 
     def __enter__(self) -> Self:

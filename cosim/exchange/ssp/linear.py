@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Count, Flag, Text
 from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.declare.settling import Settling
 
 
-class Linear(Component):
+class Linear(Settling):
     """Numbers times a factor plus an offset, in the unit that the receiving side has."""
 
     factor = Text("1", doc="of each element, by commas")
@@ -33,6 +34,10 @@ class Linear(Component):
     def _numbers(self, name: str) -> Any:
         values = np.array([float(v) for v in self.given_parameters[name].split(",")])
         return values[0] if self.given_parameters["flat"] else values
+
+    def settle(self, known: Iterable[str], outputs: Iterable[str]) -> None:
+        """Transform what there is."""
+        self._initialize_impl()
 
     def _initialize_impl(self) -> None:
         self._step_impl(0.0, 0.0)

@@ -135,10 +135,11 @@ def ssp_export(
 @ssp.command("import")
 @click.argument("file", metavar="FILE.ssp")
 @click.option("-o", "out", metavar="SYSTEM.toml", required=True, help="The file to write.")
-def ssp_import(file: str, out: str) -> None:
+@set_option
+def ssp_import(file: str, out: str, settings: Settings) -> None:
     """Write a package as a system file, its FMUs beside it."""
     from terrafix.cosim.exchange.ssp.reading import import_ssp
 
     target = writable_target(out, (".toml",))
-    folder = import_ssp(file, target)
+    folder = import_ssp(file, target, settings)
     print(f"wrote {target} and {folder}", file=sys.stderr)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from terrafix.cosim.system.system import System
 
 Settings = tuple[tuple[str, str], ...]
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 def _pairs(
@@ -33,14 +36,45 @@ def _pairs(
 
 
 system_argument = click.argument("system", metavar="SYSTEM.toml")
-set_option = click.option(
-    "--set",
-    "settings",
-    metavar="PATH=VALUE",
-    multiple=True,
-    callback=_pairs,
-    help="Set a parameter, a choice or a key of the system; may be given again.",
-)
+
+
+def _rates(context: click.Context, option: click.Parameter, values: Sequence[str]) -> None:
+    """Turn ``--rate 100Hz`` and ``--rate a=10Hz`` into settings, which come after those given."""
+    del option
+    pairs = []
+    for text in values:
+        path, equals, value = text.rpartition("=")
+        if (equals and not path.strip()) or not value.strip():
+            raise ConfigurationError(
+                f"--rate '{text}' names no step size\n  write --rate 100Hz, or --rate NAME=100Hz"
+            )
+        value = re.sub(r"(?<=[\d.])(?=[A-Za-z])", " ", value.strip(), count=1)
+        name = "period" if value.endswith("s") else "rate"
+        pairs.append((f"{path.strip()}.{name}" if equals else name, value))
+    context.params["settings"] = (*context.params.get("settings", ()), *pairs)
+
+
+def set_option(command: Command) -> Command:
+    """``--set`` and ``--rate``, which a command takes as its settings."""
+    command = click.option(
+        "--rate",
+        metavar="[NAME=]RATE",
+        multiple=True,
+        expose_value=False,
+        callback=_rates,
+        help="Step size of a package's component, or of all that have none: 100Hz, 0.01s.",
+    )(command)
+    return click.option(
+        "--set",
+        "settings",
+        metavar="PATH=VALUE",
+        multiple=True,
+        is_eager=True,
+        callback=_pairs,
+        help="Set a parameter, a choice or a key of the system; may be given again.",
+    )(command)
+
+
 seed_option = click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Root seed.")
 duration_option = click.option(
     "--duration", metavar="S", help='Simulated time, exact: "590.4" or "10 min".'

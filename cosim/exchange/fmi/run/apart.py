@@ -24,7 +24,7 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import TerrafixError
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import callbacks_of_fmi2
-from terrafix.cosim.exchange.fmi.run.fleet import Ended, Failures, Fleet, Message, Setup
+from terrafix.cosim.exchange.fmi.run.fleet import Ended, Failures, Fleet, Group, Message, Setup
 from terrafix.cosim.exchange.fmi.run.reading import REAL
 from terrafix.cosim.exchange.fmi.run.remote import (
     answer_requests,
@@ -141,12 +141,40 @@ class FleetApart:
         self._forks: dict[int, _Fork] = {}
         _prepare(setup)
 
-    def start(self, active: NDArray[np.bool_], messages: Sequence[Message] = ()) -> Failures:
+    def start(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
         """As `Fleet.start`."""
+        self._fork(active)
+        one = np.ones(1, np.bool_)
+        return self._exchange("start", lambda row: (one, _for_one(messages, row), known))
+
+    def enter(self, active: NDArray[np.bool_]) -> Failures:
+        """As `Fleet.enter`."""
+        self._fork(active)
+        return self._exchange("enter", lambda _: (np.ones(1, np.bool_),))
+
+    def settle(self, known: Sequence[Group] | None, wanted: Sequence[Group]) -> Failures:
+        """As `Fleet.settle`."""
+        return self._exchange("settle", lambda _: (known, wanted))
+
+    def leave(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
+        """As `Fleet.leave`."""
+        return self._exchange(
+            "leave", lambda row: (active[row : row + 1], _for_one(messages, row), known)
+        )
+
+    def _fork(self, active: NDArray[np.bool_]) -> None:
         for row in np.flatnonzero(active).tolist():
-            setup = _of_one(self.setup, row)
-            self._forks[row] = _Fork(partial(_one_member, setup))
-        return self._exchange("start", lambda row: (np.ones(1, np.bool_), _for_one(messages, row)))
+            self._forks[row] = _Fork(partial(_one_member, _of_one(self.setup, row)))
 
     def step(
         self,
@@ -356,7 +384,7 @@ def _play(
         for k in range(STEPS):
             if moved:
                 fleet.inputs[...] = _moved(setup, inputs, k)[chosen]
-            failures |= fleet.step(k * h, h)
+            failures |= fleet.step(setup.start_time + k * h, h)
             found.append(fleet.outputs.copy())
         if failures:
             return next(iter(failures.values()))
@@ -417,6 +445,7 @@ def _fleet_functions(fleet: Any) -> dict[str, Any]:
         return call
 
     plain = ("save", "restore", "mark", "return_to_mark", "close")
-    return {"start": exchange("start"), "step": exchange("step")} | {
+    exchanging = ("start", "enter", "settle", "leave", "step")
+    return {name: exchange(name) for name in exchanging} | {
         name: getattr(fleet, name) for name in plain
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import UNDEFINED
-from terrafix.cosim.declare.component import ATTRIBUTES, KEYS, Component
+from terrafix.cosim.declare.component import ATTRIBUTES, KEYS
 from terrafix.cosim.declare.parameters import (
     Choice,
     FilePath,
@@ -34,6 +34,7 @@ from terrafix.cosim.declare.ports import (
     Output,
     Port,
 )
+from terrafix.cosim.declare.settling import Settling
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE, STATUS
 from terrafix.cosim.exchange.fmi.run.fleet import Ended, Failures, Group, Message, Setup
@@ -52,6 +53,7 @@ from terrafix.cosim.exchange.fmi.run.reading import (
     ImportedPort,
     Interface,
     Quantity,
+    initial_dependencies,
     observed,
     read_interface,
 )
@@ -66,7 +68,7 @@ MOST_LOGGED = 20
 """Messages of one FMU that are shown."""
 
 
-class Fmu(Component):
+class Fmu(Settling):
     """A Functional Mock-up Unit, FMI 2 or 3, one instance for each member.
 
     Ports, units, arrays and start values are those of its model description, and so are parameters,
@@ -97,6 +99,7 @@ class Fmu(Component):
         doc="relative, of that integrator (0: 1e-10), or handed on to the FMU's own in "
         "co-simulation (0: what its default experiment says)",
     )
+    start_time = Parameter(0.0, unit="s", doc="time of the FMU at t = 0")
     isolate = Flag(False, doc="run it in a process of its own: slower, but its crash is survived")
     time_limit = Parameter(
         60.0, unit="s", positive=True, doc="longest answer of an isolated FMU, in real time"
@@ -107,6 +110,8 @@ class Fmu(Component):
     _from_start: frozenset[str] = frozenset()
     _quantities: dict[str, Quantity]
     _fleet: AnyFleet | None = None
+    _needs: dict[str, set[str]] | None = None
+    _begun = False
 
     # ------------------------------------------------------------------ declaration
 
@@ -176,6 +181,7 @@ class Fmu(Component):
             ).modelIdentifier
         )
         self._observe()
+        self._needs = None
         self._given = self._read_starts()
         self.ports = {port.name: self._port(port) for port in found.ports}
         for table in ("units", "frames"):
@@ -218,15 +224,19 @@ class Fmu(Component):
         self.parameter_values["start"] = self.given_parameters["start"] = start
 
     def _is_beyond_doubles(self, name: str, value: object) -> bool:
-        """Whether a whole number is one that a parameter, a double, does not hold."""
+        """Whether a whole number is one that a parameter, a double, does not hold.
+
+        Raises
+        ------
+        ConfigurationError
+            If its type does not hold it.
+        """
         assert self._found is not None
         archive, quantity = self._found[1].archive, self._found[1].parameters.get(name)
-        if quantity is None or quantity.kind not in ("Int64", "UInt64"):
+        if quantity is None or quantity.kind not in INTEGER or quantity.items:
             return False
-        try:
-            read = read_whole(value, quantity.kind, archive.version, quantity.shape, where=name)
-        except ConfigurationError:
-            return False  # this is said of the parameter
+        where = f"'{self.name}.start.{name}'"
+        read = read_whole(value, quantity.kind, archive.version, quantity.shape, where=where)
         return any(abs(int(number)) > EXACT for number in read.ravel())
 
     def _observe(self) -> None:
@@ -320,13 +330,20 @@ class Fmu(Component):
     def _read_starts(self) -> dict[str, NDArray[Any]]:
         """Values of ``start``, converted to the units of the variables."""
         known = self.settable()
-        texts = self.interface.text_parameters
         values: dict[str, NDArray[Any]] = {}
+        self._texts: list[Start] = []
         for name, value in self.given_parameters["start"].items():
+            if name in self.interface.texts:
+                if not isinstance(value, str):
+                    raise ConfigurationError(
+                        f"'{self.name}.start.{name}' is text, not {value!r}\n  write \"{value}\""
+                    )
+                self._texts.append(Start(name, "String", (self.interface.texts[name],), (value,)))
+                continue
             if name not in known:
                 raise ConfigurationError(
                     f"'{self.name}.start': the FMU has no parameter or input '{name}'\n"
-                    f"  {nearest(name, [*known, *texts], what='it has')}"
+                    f"  {nearest(name, [*known, *self.interface.texts], what='it has')}"
                 )
             quantity = known[name]
             if quantity.kind in (*INTEGER, *BOOLEAN):
@@ -346,10 +363,13 @@ class Fmu(Component):
         return values
 
     def settable(self) -> dict[str, Quantity]:
-        """Parameters and inputs that ``start`` may name."""
-        ports = self.interface.ports
-        inputs = {q.name: q for p in ports if p.is_input for q, _ in p.fields.values()}
-        return self.interface.parameters | inputs
+        """Parameters, inputs, and outputs with a start value of their own: what ``start`` names."""
+        return self.interface.parameters | {
+            q.name: q
+            for port in self.interface.ports
+            for q, _ in port.fields.values()
+            if port.is_input or (q.initial in ("exact", "approx") and q.variability != "constant")
+        }
 
     def given_starts(self) -> dict[str, NDArray[Any]]:
         """Numbers that were set, by the FMU's names, in the units of the variables."""
@@ -394,7 +414,52 @@ class Fmu(Component):
 
     # ------------------------------------------------------------------ life cycle
 
+    def taken_at_start(self) -> set[str]:
+        """Inputs that it takes in initialization mode: all but those that hold start values."""
+        held = self.given_parameters["hold_start_values"]
+        return {n for n in super().taken_at_start() if not held or self.ports[n].at == "end"}
+
+    def needed_by(self, output: str) -> set[str]:
+        """Inputs that an output depends on in initialization mode, as the FMU declares."""
+        if self._needs is None:
+            self._needs = initial_dependencies(self.interface)
+        return self._needs.get(output, super().needed_by(output))
+
+    def begin_start(self) -> None:
+        """Instantiate, and enter initialization mode."""
+        self._make_fleet()
+        assert self._fleet is not None
+        self._begun = True
+        self._tell(self._fleet.enter(self.environment.active.copy()))
+
+    def settle(self, known: Iterable[str], outputs: Iterable[str]) -> None:
+        """Set the inputs that are known and get some outputs, in initialization mode."""
+        fleet, wanted = self._fleet, set(outputs)
+        assert fleet is not None
+        groups = self._take_known(set(known))
+        self._tell(
+            fleet.settle(groups, [self._group(*k) for k in self._output_at if k[0] in wanted])
+        )
+        for port, target, source in self._results_of:
+            if port in wanted:
+                target[...] = source
+
     def _initialize_impl(self) -> None:
+        if not self._begun:
+            self._make_fleet()
+        fleet, active = self._fleet, self.environment.active.copy()
+        assert fleet is not None
+        known = self.known_at_start
+        groups = self._take_known(self.taken_at_start() if known is None else known)
+        messages = self._fresh_messages()
+        finish = fleet.leave if self._begun else fleet.start
+        self._begun = False
+        self._tell(finish(active, messages, groups))
+        for target, source in self._results:
+            target[...] = source
+        self._publish_messages()
+
+    def _make_fleet(self) -> None:
         interface, env = self.interface, self.environment
         self._inputs = [p for p in interface.ports if p.is_input and p.kind == "signal"]
         self._messages = [p for p in interface.ports if p.is_input and p.kind == "message"]
@@ -417,9 +482,10 @@ class Fmu(Component):
             self.given_parameters["solver"],
             self.tolerance_of_solver(),
             interface.event_mode,
+            float(self.given_parameters["start_time"]),
         )
         starts = np.zeros((env.n_members, sum(g.size for g in inputs)))
-        self._kinds = {(port, name): q.kind for port, name, q in (*read, *written)}
+        self._quantity_at = {(port, name): q for port, name, q in (*read, *written)}
         for port, name, quantity in read:
             columns = cells(starts, quantity.kind, self._input_at[port, name])
             columns[...] = self._start_value(quantity).ravel()
@@ -433,32 +499,27 @@ class Fmu(Component):
         )
         self.remarks = [remark] if remark else []
         self._sequence = {p.name: np.zeros(env.n_members, np.int64) for p in self._outputs}
-        self._t, self._first, self._logged = 0.0, True, 0
+        self._t, self._first, self._logged = setup.start_time, True, 0
+        self._start_time = setup.start_time
         self._skipped = ~env.active
         self._fleet.inputs[...] = starts
-        self._take_inputs(finite=True)
         self._bind_copies()
-        failures = self._fleet.start(env.active.copy(), self._fresh_messages())
-        self._show_log(self._fleet.take_log(), failures)
-        self._report(failures)
-        for target, source in self._results:
-            target[...] = source
-        self._publish_messages()
 
     def _start_settings(self) -> list[Start]:
-        """Parameters that were set, or that members have values of their own of."""
+        """What was set, or what members have values of their own of; not the inputs."""
         found = [
             start_values(name, self._quantities[name], setting, self.parameter_values[name])
             for name, setting in self._found_settings.items()
             if name in self.given_parameters or self._is_dispersed(name, setting)
         ]
-        parameters = self.interface.parameters
-        for name in self._given.keys() & parameters.keys():  # beyond doubles, or of the run
-            q = parameters[name]
-            structural = q.causality == STRUCTURAL
-            rows = self._given[name].reshape(1, -1)
-            found.append(Start(name, q.kind, tuple(q.references), rows, structural))
-        return found
+        known = self.settable()
+        for name, value in self._given.items():  # outputs, and numbers that no double holds
+            q = known[name]
+            if q.causality != "input":
+                structural = q.causality == STRUCTURAL
+                rows = value.reshape(1, -1)
+                found.append(Start(name, q.kind, tuple(q.references), rows, structural))
+        return [*found, *self._texts]
 
     def _is_dispersed(self, name: str, setting: Setting[object]) -> bool:
         if not isinstance(setting, Parameter) or name not in self.parameter_values:
@@ -487,30 +548,49 @@ class Fmu(Component):
         plain: NDArray[Any] = view
         return plain
 
-    def _take_inputs(self, *, finite: bool = False, late: bool = True) -> None:
-        """Copy inputs into the rows; only those that are known, and not those read at the start."""
+    def _take_known(self, known: Collection[str]) -> list[Group] | None:
+        """Copy into the rows what is known at the start: inputs that may be set; None if all may.
+
+        An input that is not known keeps its start value; the FMU its own, where it gives none.
+        """
+        groups, left_out = [], False
         for port, name in self._input_at:
-            if not late and self.ports[port].at == "start":
+            quantity = self._quantity_at[port, name]
+            if port in known:
+                rows = self._view(port, name).reshape(self.n_members, -1)
+                finite = np.isfinite(rows.astype(np.float64)).all(axis=1)
+                self._input_cells(port, name)[finite] = rows[finite]
+            elif quantity.start is None and quantity.name not in self._given:
+                left_out = True
                 continue
-            rows = self._view(port, name).reshape(self.n_members, -1)
-            target = self._input_cells(port, name)
-            if finite:
-                known = np.isfinite(rows.astype(np.float64)).all(axis=1)
-                target[known] = rows[known]
-            else:
-                target[...] = rows
+            groups.append(self._group(port, name))
+        return groups if left_out else None
+
+    def _group(self, port: str, name: str) -> Group:
+        """One quantity by itself."""
+        quantity = self._quantity_at[port, name]
+        places = self._input_at if (port, name) in self._input_at else self._output_at
+        columns = places[port, name]
+        return Group(quantity.kind, tuple(quantity.references), columns.start, quantity.size)
+
+    def _take_late_inputs(self) -> None:
+        """Copy inputs into the rows, but not those that are read at the start of a step."""
+        for port, name in self._input_at:
+            if self.ports[port].at == "end":
+                rows = self._view(port, name).reshape(self.n_members, -1)
+                self._input_cells(port, name)[...] = rows
 
     def _input_cells(self, port: str, name: str) -> NDArray[Any]:
         """What the FMU will read, (n_members, size), in the type of the port."""
         assert self._fleet is not None
         key = port, name
-        return cells(self._fleet.inputs, self._kinds[key], self._input_at[key])
+        return cells(self._fleet.inputs, self._quantity_at[key].kind, self._input_at[key])
 
     def _output_cells(self, port: str, name: str) -> NDArray[Any]:
         """What the FMU has written."""
         assert self._fleet is not None
         key = port, name
-        return cells(self._fleet.outputs, self._kinds[key], self._output_at[key])
+        return cells(self._fleet.outputs, self._quantity_at[key].kind, self._output_at[key])
 
     def _bind_copies(self) -> None:
         """Pairs (target, source) of what is copied before and after each step."""
@@ -519,17 +599,18 @@ class Fmu(Component):
             (self._input_cells(port, name), self._view(port, name).reshape(n, -1))
             for port, name in self._input_at
         ]
-        self._results = [
-            (self._view(port, name).reshape(n, -1), self._output_cells(port, name))
+        self._results_of = [
+            (port, self._view(port, name).reshape(n, -1), self._output_cells(port, name))
             for port, name in self._output_at
             if self.ports[port].kind == "signal"
         ]
+        self._results = [(target, source) for _, target, source in self._results_of]
 
     def _step_impl(self, t: float, dt: float) -> None:
         fleet = self._fleet
         assert fleet is not None
         if self._first and self.given_parameters["hold_start_values"]:
-            self._take_inputs(late=False)
+            self._take_late_inputs()
         else:
             for target, source in self._copies:
                 target[...] = source
@@ -543,8 +624,9 @@ class Fmu(Component):
                 self._skipped |= gone
         messages = self._fresh_messages() if self._messages else ()
         # not dt: the FMU must find the end of its step at t_now + h, to the last bit
-        failures = fleet.step(self._t, t - self._t, messages, skipped)
-        self._t = t
+        now = t + self._start_time
+        failures = fleet.step(self._t, now - self._t, messages, skipped)
+        self._t = now
         if said := fleet.take_log():
             self._show_log(said, failures)
         if failures:
@@ -552,6 +634,13 @@ class Fmu(Component):
         for target, source in self._results:
             target[...] = source
         self._publish_messages()
+
+    def _tell(self, failures: Failures) -> None:
+        """Show what the FMU logged, and report failures."""
+        assert self._fleet is not None
+        if said := self._fleet.take_log():
+            self._show_log(said, failures)
+        self._report(failures)
 
     def _show_log(self, said: Sequence[tuple[int, int, str]], failures: Failures) -> None:
         """Show what the FMU logged, with the member; not what a failure quotes."""

@@ -9,7 +9,7 @@ whose instance fails is reported with what the FMU said; the others go on. `Flee
 from __future__ import annotations
 
 import ctypes as ct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -92,6 +92,8 @@ class Setup:
         Of the integrator in model exchange; in co-simulation handed on to the FMU, if there is one.
     event_mode : bool
         Of co-simulation with FMI 3.
+    start_time : float
+        Time of the FMU at t = 0 [s].
     """
 
     file: str
@@ -103,6 +105,7 @@ class Setup:
     solver: str = "cvode"
     tolerance: float | None = None
     event_mode: bool = False
+    start_time: float = 0.0
 
     def of(self, members: Sequence[int]) -> Setup:
         """What a fleet of some of its members is made from."""
@@ -247,23 +250,72 @@ class Fleet:
 
     # ------------------------------------------------------------------ life cycle
 
-    def start(self, active: NDArray[np.bool_], messages: Sequence[Message] = ()) -> Failures:
+    def start(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
         """Instantiate and initialize the active members with what stands in `inputs`.
 
-        Afterwards `outputs` hold the values at t = 0.
+        Only `known` inputs are set, if they are given. Afterwards `outputs` hold the values at the
+        start.
         """
-        failures: Failures = {}
-        for row in np.flatnonzero(active).tolist():
-            try:
-                self._start_one(row, messages)
-            except FmuError as error:
-                self._note(row, error, failures)
+
+        def start_one(row: int) -> None:
+            self._enter_one(row)
+            self._leave_one(row, messages, known)
+
+        failures = self._each(np.flatnonzero(active).tolist(), start_one)
         self._active[:] = active
         self._live = self._find_live()
         self._prepare_calls()
         return failures
 
-    def _start_one(self, row: int, messages: Sequence[Message]) -> None:
+    def enter(self, active: NDArray[np.bool_]) -> Failures:
+        """Instantiate the active members, enter initialization mode: the first half of `start`."""
+        self._active[:] = active
+        failures = self._each(np.flatnonzero(active).tolist(), self._enter_one)
+        self._live = self._find_live()
+        return failures
+
+    def settle(self, known: Sequence[Group] | None, wanted: Sequence[Group]) -> Failures:
+        """Set some inputs (all, if absent) and get some outputs, in initialization mode."""
+
+        def settle_one(row: int) -> None:
+            instance = self.instances[row]
+            assert instance is not None
+            self._set_some(instance, row, self.setup.inputs if known is None else known)
+            self._get_some(instance, row, wanted)
+
+        failures = self._each(self._live, settle_one)
+        self._live = self._find_live()
+        return failures
+
+    def leave(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
+        """Set `known` inputs and leave initialization mode: the second half of `start`."""
+        self._active[:] &= active
+        self._live = self._find_live()
+        failures = self._each(self._live, lambda row: self._leave_one(row, messages, known))
+        self._live = self._find_live()
+        self._prepare_calls()
+        return failures
+
+    def _each(self, rows: Sequence[int], action: Callable[[int], None]) -> Failures:
+        failures: Failures = {}
+        for row in rows:
+            try:
+                action(row)
+            except FmuError as error:
+                self._note(row, error, failures)
+        return failures
+
+    def _enter_one(self, row: int) -> None:
         name = f"{self.setup.name}_{row}"
         instance = Instance(self.library, name, event_mode=self.setup.event_mode)
         self.instances[row] = instance
@@ -273,9 +325,15 @@ class Fleet:
             self._set_starts(instance, row, structural)
             instance.call("ExitConfigurationMode")
         self._set_starts(instance, row, [s for s in self.setup.starts if not s.structural])
-        tolerance = self.setup.tolerance
-        instance.begin(0.0, tolerance if self.setup.kind == CO_SIMULATION else None)
-        self._set_all(instance, row)
+        own = self.setup.tolerance if self.setup.kind == CO_SIMULATION else None
+        instance.begin(self.setup.start_time, own)
+
+    def _leave_one(
+        self, row: int, messages: Sequence[Message], known: Sequence[Group] | None
+    ) -> None:
+        instance = self.instances[row]
+        assert instance is not None
+        self._set_some(instance, row, self.setup.inputs if known is None else known)
         for message in messages:
             message.send(row, instance)
         instance.finish()
@@ -283,9 +341,9 @@ class Fleet:
             self._integrators[row] = Integrator(
                 instance,
                 self.archive,
-                0.0,
+                self.setup.start_time,
                 self.setup.solver,
-                tolerance or MODEL_EXCHANGE_TOLERANCE,
+                self.setup.tolerance or MODEL_EXCHANGE_TOLERANCE,
             )
         self._last[row] = self.inputs[row, self._discrete].view(np.int64)
         self._get_all(instance, row)
@@ -301,25 +359,36 @@ class Fleet:
             except FmuError as error:
                 raise FmuError(f"its '{start.name}' was refused: {error}", error.status) from error
 
+    def _set_some(self, instance: Instance, row: int, groups: Sequence[Group]) -> None:
+        for group in groups:
+            columns = slice(group.start, group.start + group.size)
+            values = cells(self.inputs, group.kind, columns)[row]
+            instance.set(group.kind, self._referred(group), values)
+
+    def _get_some(self, instance: Instance, row: int, groups: Sequence[Group]) -> None:
+        for group in groups:
+            values = instance.get(group.kind, self._referred(group), group.size)
+            if group.kind == "UInt64" and len(values) and int(values.max()) > MOST:
+                raise FmuError(f"an output (UInt64) is {values.max()}; a port holds at most {MOST}")
+            columns = slice(group.start, group.start + group.size)
+            cells(self.outputs, group.kind, columns)[row] = values
+
+    def _referred(self, group: Group) -> Any:
+        if group not in self._references:
+            self._references[group] = references(group.references)
+        return self._references[group]
+
     def _set_all(
         self, instance: Instance, row: int, *, discrete: tuple[bool, ...] = (False, True)
     ) -> None:
-        for group in self.setup.inputs:
-            if group.discrete not in discrete:
-                continue
-            columns = slice(group.start, group.start + group.size)
-            values = cells(self.inputs, group.kind, columns)[row]
-            instance.set(group.kind, self._references[group], values)
+        self._set_some(instance, row, [g for g in self.setup.inputs if g.discrete in discrete])
 
     def _get_all(self, instance: Instance, row: int) -> None:
+        self._get_some(instance, row, self.setup.outputs)
         for group in self.setup.outputs:
-            values = instance.get(group.kind, self._references[group], group.size)
-            if group.kind == "UInt64" and len(values) and int(values.max()) > MOST:
-                raise FmuError(f"an output (UInt64) is {values.max()}; a port holds at most {MOST}")
-            if group.kind not in INTEGER and not np.isfinite(values).all():
-                raise FmuError("an output is not finite")
             columns = slice(group.start, group.start + group.size)
-            cells(self.outputs, group.kind, columns)[row] = values
+            if group.kind not in INTEGER and not np.isfinite(self.outputs[row, columns]).all():
+                raise FmuError("an output is not finite")
 
     # ------------------------------------------------------------------ stepping
 

@@ -9,15 +9,16 @@ these stand still. (With an explicit Euler step inside, that is the implicit Eul
 from __future__ import annotations
 
 import re
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, WiringError, nearest
-from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Count, FileTable, Parameter, Text
 from terrafix.cosim.declare.ports import Capabilities, Input, Output, Port
+from terrafix.cosim.declare.settling import Settling
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION
 from terrafix.cosim.exchange.fmi.run.component import Fmu, grouped, usual_step
 from terrafix.cosim.exchange.fmi.run.fleet import Ended, Setup
@@ -27,7 +28,7 @@ from terrafix.cosim.system.wiring import check_connection, port_factor
 _CONNECTION = re.compile(r"\s*(\w+)\.(\w+)\s*->\s*(\w+)\.(\w+)\s*\Z")
 
 
-class FmuLoop(Component):
+class FmuLoop(Settling):
     """Several FMUs for co-simulation, iterated in every step until their signals agree.
 
     Outputs are called ``a_y`` for output y of FMU a; inputs that are not connected within
@@ -38,6 +39,8 @@ class FmuLoop(Component):
     connect = Text(doc='connections within: "a.y -> b.u, b.y -> a.u"')
     tolerance = Parameter(1e-12, positive=True, doc="of a signal, relative to one plus its size")
     most_iterations = Count(100, minimum=1, doc="steps repeated at most so often")
+
+    _begun = False
 
     def prepare(self) -> None:
         """Read the files, and declare the ports that are not connected within."""
@@ -109,7 +112,42 @@ class FmuLoop(Component):
 
     # ------------------------------------------------------------------ life cycle
 
+    def begin_start(self) -> None:
+        """Instantiate all, and enter initialization mode."""
+        self._make_fleets()
+        self._begun = True
+        for name, fleet in self._fleets.items():
+            self._report(name, fleet.enter(self.environment.active.copy()))
+
+    def settle(self, known: Iterable[str], outputs: Iterable[str]) -> None:
+        """Hand on outputs within, in initialization mode, until they stand still."""
+        del outputs  # all of them
+        self._outside(finite=True, known=set(known))
+        most = self.given_parameters["most_iterations"]
+        for _ in range(max(most, len(self._parts) + 1)):
+            for name, fleet in self._fleets.items():
+                groups = fleet.setup.inputs, fleet.setup.outputs
+                self._report(name, fleet.settle(*groups))
+            change = self._inside()
+            wanting = (change > self.parameter_values["tolerance"]) & self.environment.active
+            if not wanting.any():
+                break
+        else:
+            self.fail(wanting, f"at t = 0, signals did not settle in {most} repetitions")
+        self._publish()
+
     def _initialize_impl(self) -> None:
+        if not self._begun:
+            self.begin_start()
+        self._begun = False
+        known = self.known_at_start
+        self.settle(self.taken_at_start() if known is None else known, ())
+        for name, fleet in self._fleets.items():
+            self._report(name, fleet.leave(self.environment.active.copy()))
+        self._inside()
+        self._publish()
+
+    def _make_fleets(self) -> None:
         env = self.environment
         self._fleets: dict[str, AnyFleet] = {}
         self.remarks = []
@@ -138,18 +176,13 @@ class FmuLoop(Component):
             self.remarks += [remark] if remark else []
             fleet.inputs[...] = starts
         self._t = 0.0
-        self._outside(finite=True)
-        for name, fleet in self._fleets.items():
-            self._report(name, fleet.start(env.active.copy()))
-        self._inside()
-        self._publish()
 
-    def _outside(self, *, finite: bool = False) -> None:
-        """Take the inputs that come from outside."""
+    def _outside(self, *, finite: bool = False, known: Collection[str] | None = None) -> None:
+        """Take the inputs that come from outside, or those that are known of them."""
         for name, part in self._parts.items():
             for port in part.inputs():
                 view = self.port_views.get(f"{name}_{port}")
-                if view is None:
+                if view is None or (known is not None and f"{name}_{port}" not in known):
                     continue
                 rows = view.reshape(self.n_members, -1)
                 target = self._fleets[name].inputs[:, self._at[name, port]]

@@ -25,6 +25,8 @@ from terrafix.cosim.memory.fields import Field, Unit
 REAL = ("Real", "Float64", "Float32")
 CONNECTED = ("input", "output")
 PARAMETERS = ("parameter", "structuralParameter")
+_SETTABLE = ("exact", "approx")
+_KNOWN = ("input", "parameter", "structuralParameter", "independent")
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\d+)*)\]\Z")
 
 
@@ -51,6 +53,10 @@ class Quantity:
         As FMPy read them.
     texts : list of str or None
         Start values of a String.
+    initial : str or None
+        How the start is found, as far as the description says.
+    items : dict of str to int
+        Of an enumeration, by name.
     """
 
     name: str
@@ -65,6 +71,8 @@ class Quantity:
     base: int = 1
     variables: Sequence[Any] = ()
     texts: list[str] | None = None
+    initial: str | None = None
+    items: dict[str, int] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -136,6 +144,8 @@ class Interface:
         Whether terrafix wrote it.
     once : bool
         Whether it says that a process can have one instance of it.
+    texts : dict of str to int
+        Value references of texts that may be set before initialization, by name.
     """
 
     archive: Archive
@@ -148,6 +158,7 @@ class Interface:
     own: bool
     once: bool = False
     text_parameters: dict[str, Quantity] = field(default_factory=dict)
+    texts: dict[str, int] = field(default_factory=dict)
 
     @property
     def event_mode(self) -> bool:
@@ -233,7 +244,19 @@ def read_interface(
         own=archive.annotation is not None,
         once=bool(interface.canBeInstantiatedOnlyOncePerProcess),
         text_parameters={q.name: q for q in parameters if q.kind == "String"},
+        texts=_settable_texts(description),
     )
+
+
+def _settable_texts(description: Any) -> dict[str, int]:
+    return {
+        v.name: int(v.valueReference)
+        for v in description.modelVariables
+        if v.type == "String"
+        and not v.dimensions
+        and v.variability != "constant"
+        and (v.causality in ("input", "parameter") or v.initial in _SETTABLE)
+    }
 
 
 # --------------------------------------------------------------------------------- variables
@@ -351,7 +374,18 @@ def _quantity(
         " ".join((first.description or "").split()),
         variables=tuple(members),
         texts=_texts(members, size) if text else None,
+        initial=first.initial,
+        items=_items(first),
     )
+
+
+def _items(variable: Any) -> dict[str, int]:
+    """Items of an enumeration by name."""
+    declared = getattr(variable.declaredType, "items", None) or ()
+    return {
+        str(item.name): k + 1 if item.value is None else int(item.value)
+        for k, item in enumerate(declared)
+    }
 
 
 class Units:
@@ -408,6 +442,49 @@ def _starts(members: Sequence[Any]) -> list[float] | list[int] | None:
     if kind in INTEGER:
         return [whole_start(members[0].name, kind, w) for w in words]
     return [1.0 if w == "true" else 0.0 if w == "false" else float(w) for w in words]
+
+
+# --------------------------------------------------------------------------------- dependencies
+
+
+def initial_dependencies(interface: Interface) -> dict[str, set[str]]:
+    """Input ports that each output port depends on in initialization mode.
+
+    As InitialUnknowns declare; where these do not list an output, as Outputs do, if it depends on
+    inputs alone. What is not declared depends on all inputs; a start that is exact on none.
+    """
+    description = interface.archive.description
+    inputs: dict[str, str] = {}
+    outputs: dict[str, list[str]] = {}
+    for port in interface.ports:
+        names = [n for q, _ in port.fields.values() for n in {q.name, *q.scalars()}]
+        if port.is_input and port.kind == "signal":
+            inputs |= dict.fromkeys(names, port.name)
+        elif not port.is_input:
+            outputs[port.name] = names
+    everything = set(inputs.values())
+    at_start = {u.variable.name: u for u in description.initialUnknowns}
+    later = {u.variable.name: u for u in description.outputs}
+    variables = {v.name: v for v in description.modelVariables}
+
+    def needs(name: str) -> set[str]:
+        known = at_start.get(name) or later.get(name)
+        if name not in at_start and variables[name].initial == "exact":
+            return set()
+        if known is None or known.dependencies is None:
+            return everything
+        found = set()
+        for variable in known.dependencies:
+            if variable.name in inputs:
+                found.add(inputs[variable.name])
+            elif name not in at_start and variable.causality not in _KNOWN:
+                return everything  # a state, whose own start is not declared
+        return found
+
+    return {
+        port: set().union(*(needs(n) for n in names if n in variables))
+        for port, names in outputs.items()
+    }
 
 
 # --------------------------------------------------------------------------------- ports

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
-from terrafix.cosim.exchange.fmi.run.fleet import Failures, Message, Setup
+from terrafix.cosim.exchange.fmi.run.fleet import Failures, Group, Message, Setup
 
 _HEADER = struct.Struct("<Q")
 _LOOK = 0.2  # how often it is looked whether a silent process is there [s]
@@ -243,9 +243,31 @@ class RemoteFleet:
         own_limit = limit if apart else None
         self._worker.call("make", setup, n_members, own_limit, limit=FIRST_LIMIT)
 
-    def start(self, active: NDArray[np.bool_], messages: Sequence[Message] = ()) -> Failures:
+    def start(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
         """As `Fleet.start`."""
-        return self._exchange("start", active, messages)
+        return self._exchange("start", active, messages, known)
+
+    def enter(self, active: NDArray[np.bool_]) -> Failures:
+        """As `Fleet.enter`."""
+        return self._exchange("enter", active)
+
+    def settle(self, known: Sequence[Group] | None, wanted: Sequence[Group]) -> Failures:
+        """As `Fleet.settle`."""
+        return self._exchange("settle", known, wanted)
+
+    def leave(
+        self,
+        active: NDArray[np.bool_],
+        messages: Sequence[Message] = (),
+        known: Sequence[Group] | None = None,
+    ) -> Failures:
+        """As `Fleet.leave`."""
+        return self._exchange("leave", active, messages, known)
 
     def step(
         self,

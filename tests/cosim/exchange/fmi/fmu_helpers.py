@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
+
+import pytest
 
 from terrafix.cosim.exchange.fmi.run.platforms import host_platform
 from terrafix.cosim.exchange.fmi.write.binaries import build
@@ -55,3 +60,27 @@ def broken(source, target, patches=(), xml=()):
 
 def has_zig():
     return importlib.util.find_spec("ziglang") is not None
+
+
+def in_another_process(tool, code, *arguments):
+    if importlib.util.find_spec(tool) is None:
+        pytest.skip(f"{tool} is not installed")
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    lines = [x for x in done.stdout.splitlines() if x.startswith("RESULT")]
+    if not lines and "cannot open shared object" in done.stderr:
+        pytest.skip(f"{tool} cannot be loaded: {done.stderr.strip().splitlines()[-1]}")
+    assert lines, done.stderr[-800:]
+    return json.loads(lines[0].removeprefix("RESULT"))
+
+
+ECOS = """
+import json, sys
+from ecospy import EcosSimulation
+with EcosSimulation(step_size=0.01, ssp_path=sys.argv[1]) as simulation:
+    simulation.init(0.0)
+    simulation.step(int(sys.argv[2]))
+    print("RESULT", json.dumps([simulation.get_real(n) for n in sys.argv[3:]]))
+"""

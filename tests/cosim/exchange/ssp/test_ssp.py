@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
-import subprocess
-import sys
 import zipfile
 
 import fmu_parts
 import numpy as np
 import pytest
-from fmu_helpers import OPEN_LOOP, without_evaluation
+from fmu_helpers import ECOS, OPEN_LOOP, in_another_process, without_evaluation
 
 from terrafix.cli import main
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -59,28 +55,6 @@ def in_fmpy(file, names, n=100):
     return [float(rows[-1][name]) for name in names]
 
 
-def in_another_process(tool, code, *arguments):
-    if importlib.util.find_spec(tool) is None:
-        pytest.skip(f"{tool} is not installed")
-    done = subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    lines = [x for x in done.stdout.splitlines() if x.startswith("RESULT")]
-    if not lines and "cannot open shared object" in done.stderr:
-        pytest.skip(f"{tool} cannot be loaded: {done.stderr.strip().splitlines()[-1]}")
-    assert lines, done.stderr[-800:]
-    return json.loads(lines[0].removeprefix("RESULT"))
-
-
-ECOS = """
-import json, sys
-from ecospy import EcosSimulation
-with EcosSimulation(step_size=0.01, ssp_path=sys.argv[1]) as simulation:
-    simulation.init(0.0)
-    simulation.step(int(sys.argv[2]))
-    print("RESULT", json.dumps([simulation.get_real(n) for n in sys.argv[3:]]))
-"""
 LIBCOSIM = """
 import json, sys
 from libcosimpy.CosimExecution import CosimExecution

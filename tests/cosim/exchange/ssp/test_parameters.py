@@ -1,0 +1,393 @@
+"""Rules of SSP for parameters, names and versions, on packages of the smallest FMUs."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+
+import numpy as np
+import pytest
+from fmu_helpers import ECOS, in_another_process
+from plain_fmus import V, plain_fmu
+
+from terrafix.cli import main
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.exchange.fmi.run.binding import MODEL_EXCHANGE
+from terrafix.cosim.exchange.ssp.names import SSC, SSD, SSM, SSV
+from terrafix.cosim.exchange.ssp.reading import read_ssp
+from terrafix.cosim.system.check import check
+
+
+@pytest.fixture(scope="module")
+def fmus(tmp_path_factory):
+    """k: y = k + u, length in m, and what it holds. p and q as in `test_starting`."""
+    folder = tmp_path_factory.mktemp("fmus")
+    kinds = [V("on", "parameter", True, "Boolean"), V("mode", "parameter", 1, "Enumeration")]
+    plain_fmu(
+        folder / "k.fmu",
+        [
+            V("u", "input", 0.0),
+            V("k", "parameter", 1.0),
+            V("length", "parameter", 1.0, unit="m"),
+            *kinds,
+            V("word", "parameter", "no", "String"),
+            V("echo", "output", kind="String"),
+            V("y", "output", depends="u"),
+            V("said", "output", kind="Integer"),
+            V("far", "output", unit="m"),
+            V("kept", "output", 4.0, initial="exact"),
+            V("time", "output"),
+        ],
+        begin="time = t;",
+        outputs="y = k + u; said = 10 * mode + on + 100 * (int)strlen(word); far = length;",
+        step="time = t + h;",
+    )
+    plain_fmu(folder / "p.fmu", [V("x", "output", 1.0, depends="")], step="x = 1.0 + t + h;")
+    plain_fmu(
+        folder / "q.fmu",
+        [V("u", "input", 0.0), V("y", "output", depends="u"), V("s", "local")],
+        begin="s = u;",
+        outputs="y = s;",
+        step="s += h * u;",
+    )
+    return {n: (folder / f"{n}.fmu").read_bytes() for n in "kpq"}
+
+
+def part(name, source="k", inside="", more=""):
+    return f'<ssd:Component name="{name}" source="{source}.fmu" {more}>{inside}</ssd:Component>'
+
+
+def bound(prefix="", mapping="", **values):
+    written = ""
+    for name, value in values.items():
+        kind, text = value if isinstance(value, tuple) else ("Real", value)
+        name = name.replace("__", ".")
+        written += f'<ssv:Parameter name="{name}"><ssv:{kind} value="{text}"/></ssv:Parameter>'
+    written = written.replace(' m"', '" unit="m"').replace(' cm"', '" unit="cm"')
+    return (
+        f'<ssd:ParameterBinding prefix="{prefix}"><ssd:ParameterValues><ssv:ParameterSet '
+        f'version="1.0" name="v"><ssv:Parameters>{written}</ssv:Parameters></ssv:ParameterSet>'
+        f"</ssd:ParameterValues>{mapping}</ssd:ParameterBinding>"
+    )
+
+
+def bindings(*each):
+    return f"<ssd:ParameterBindings>{''.join(each)}</ssd:ParameterBindings>"
+
+
+def connectors(**kinds):
+    made = "".join(
+        f'<ssd:Connector name="{n}" kind="{k}"><ssc:Real/></ssd:Connector>'
+        for n, k in kinds.items()
+    )
+    return f"<ssd:Connectors>{made}</ssd:Connectors>"
+
+
+def link(start, end, inside=""):
+    text = ""
+    for side, name in (("start", start), ("end", end)):
+        owner, _, connector = name.rpartition(".")
+        text += f' {side}Element="{owner}"' if owner else ""
+        text += f' {side}Connector="{connector}"'
+    return f"<ssd:Connection{text}>{inside}</ssd:Connection>"
+
+
+def system(elements, *links, name="top", before=""):
+    joined = f"<ssd:Connections>{''.join(links)}</ssd:Connections>" if links else ""
+    return (
+        f'<ssd:System name="{name}">{before}<ssd:Elements>{elements}</ssd:Elements>'
+        f"{joined}</ssd:System>"
+    )
+
+
+STEP = (
+    '<ssd:Annotations><ssc:Annotation type="com.opensimulationplatform"><osp:Algorithm '
+    'xmlns:osp="http://opensimulationplatform.com/SSP/OSPAnnotations">'
+    '<osp:FixedStepAlgorithm baseStepSize="0.1"/></osp:Algorithm></ssc:Annotation>'
+    "</ssd:Annotations>"
+)
+
+
+def packaged(
+    path,
+    fmus,
+    top,
+    *,
+    version="1.0",
+    experiment='startTime="0" stopTime="1"',
+    step=STEP,
+    declared=True,
+    **files,
+):
+    text = (
+        f'<ssd:SystemStructureDescription xmlns:ssd="{SSD}" xmlns:ssc="{SSC}" xmlns:ssv="{SSV}" '
+        f'xmlns:ssm="{SSM}" version="{version}" name="theirs">{top}'
+        f"<ssd:DefaultExperiment {experiment}>{step}</ssd:DefaultExperiment>"
+        "</ssd:SystemStructureDescription>"
+    )
+    if not declared:
+        for prefix in ("ssc", "ssv", "osp"):
+            text = re.sub(f' xmlns:{prefix}="[^"]*"', "", text)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("SystemStructure.ssd", text)
+        for name, data in ({f"{n}.fmu": d for n, d in fmus.items()} | files).items():
+            archive.writestr(name.replace("_ssm", ".ssm"), data)
+    return path
+
+
+def values(file, *paths, t="0"):
+    simulation = Simulation(read_ssp(file), members=1)
+    simulation.run_until(t)
+    found = [simulation.master.wiring.slots[p].data[0, 0].item() for p in paths]
+    simulation.master.terminate()
+    return found
+
+
+# ------------------------------------------------------------------ what is set
+
+
+def test_the_higher_level_wins_and_names_are_hierarchical(tmp_path, fmus):
+    """a.k: 2 by its own, 3 by system B, 5 by the top; b.k: 3 by B alone, c.k: 2 by its own."""
+    own = bindings(bound(k="2"))
+    inner = system(
+        part("a", inside=own) + part("b", inside=own) + part("c", inside=own),
+        name="B",
+        before=bindings(bound(a__k="3", b__k="3")),
+    )
+    file = packaged(tmp_path / "x.ssp", fmus, system(inner, before=bindings(bound(B__a__k="5"))))
+    assert values(file, "B_a.y", "B_b.y", "B_c.y") == [5.0, 3.0, 2.0]
+
+
+def test_of_one_level_the_later_wins_and_a_prefix_comes_first(tmp_path, fmus):
+    top = system(
+        part("a"), before=bindings(bound(a__k="2"), bound(prefix="a.", k="7"), bound(k="9"))
+    )
+    assert values(packaged(tmp_path / "x.ssp", fmus, top), "a.y") == [7.0]
+
+
+def test_connectors_of_systems_hand_on_to_all_their_readers(tmp_path, fmus):
+    """gain reaches a.k and, within B, c.k times 3 plus 1; level reaches the inputs of a and b."""
+    twice = '<ssc:LinearTransformation factor="3" offset="1"/>'
+    inner = system(
+        part("c"), link("inside", "c.k", twice), name="B", before=connectors(inside="parameter")
+    )
+    top = system(
+        part("a") + part("b") + inner,
+        link("gain", "a.k"),
+        link("gain", "B.inside"),
+        link("level", "a.u"),
+        link("level", "b.u"),
+        before=connectors(gain="parameter", level="input") + bindings(bound(gain="2", level="10")),
+    )
+    file = packaged(tmp_path / "x.ssp", fmus, top)
+    assert values(file, "a.y", "b.y", "B_c.y") == [12.0, 11.0, 7.0]
+    assert read_ssp(file).exposed == {"level_a": "a.u", "level_b": "b.u"}
+
+
+def test_all_types_units_and_outputs_whose_start_is_exact(tmp_path, fmus):
+    given = bound(
+        on=("Boolean", "false"), mode=("Enumeration", "fast"), word=("String", "hello"),
+        length="250 cm", kept="8", nobody="1",
+    )  # fmt: skip
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a", inside=bindings(given))))
+    # said = 10 mode + on + 100 letters
+    assert values(file, "a.said", "a.far", "a.kept") == [10 * 3 + 0 + 100 * 5, 2.5, 8.0]
+
+
+def test_a_value_of_another_type_is_named(tmp_path, fmus):
+    given = bindings(bound(mode=("Enumeration", "slow")))
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a", inside=given)))
+    with pytest.raises(ConfigurationError, match=r"'mode' takes one of off, on, fast, not 'slow'"):
+        read_ssp(file)
+
+
+def test_text_that_is_connected_is_named(tmp_path, fmus):
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a") + part("b"), link("a.echo", "b.u")))
+    with pytest.raises(ConfigurationError, match=r"connects 'a.echo', which is no number"):
+        read_ssp(file)
+
+
+def test_mappings_inline_and_in_a_file(tmp_path, fmus):
+    """length = 2 * 3 m + 0.5; mode by a table from 7 to 2; what is not mapped keeps its name."""
+    entries = (
+        '<ssm:MappingEntry source="L" target="length"><ssc:LinearTransformation factor="2" '
+        'offset="0.5"/></ssm:MappingEntry><ssm:MappingEntry source="number" target="mode">'
+        '<ssc:IntegerMappingTransformation><ssc:MapEntry source="7" target="2"/>'
+        "</ssc:IntegerMappingTransformation></ssm:MappingEntry>"
+    )
+    mapping = (
+        f'<ssm:ParameterMapping xmlns:ssm="{SSM}" xmlns:ssc="{SSC}" version="1.0">{entries}'
+        "</ssm:ParameterMapping>"
+    )
+    given = {"L": "300 cm", "number": ("Integer", "7"), "k": "6"}
+    inline = f"<ssd:ParameterMapping>{mapping}</ssd:ParameterMapping>"
+    for how, files in (
+        (inline, {}),
+        ('<ssd:ParameterMapping source="m.ssm"/>', {"m_ssm": mapping}),
+    ):
+        top = system(part("a", inside=bindings(bound(mapping=how, **given))))
+        file = packaged(tmp_path / "x.ssp", fmus, top, **files)
+        assert values(file, "a.far", "a.said", "a.y") == [6.5, 20 + 1 + 200, 6.0]
+
+
+# ------------------------------------------------------------------ names, kinds, times, versions
+
+
+def test_names_that_read_alike_are_kept_apart(tmp_path, fmus):
+    top = system(
+        part("a-b", inside=bindings(bound(k="2"))) + part("a b", inside=bindings(bound(k="3"))),
+        link("a b.y", "a-b.u"),
+    )
+    file = packaged(tmp_path / "x.ssp", fmus, top)
+    assert values(file, "a_b.y", "a_b_2.y") == [5.0, 3.0]
+
+
+def test_one_name_twice_is_an_error(tmp_path, fmus):
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a") + part("a")))
+    with pytest.raises(ConfigurationError, match=r"system 'top' has two elements 'a'"):
+        read_ssp(file)
+
+
+def test_an_fmu_is_run_as_its_component_says(tmp_path, spring, fmus):
+    wanted = part("a", "s", more='implementation="ModelExchange"')
+    file = packaged(tmp_path / "x.ssp", {"s": spring(2).read_bytes()}, system(wanted))
+    assert read_ssp(file).nodes["a"].interface.kind == MODEL_EXCHANGE
+    for kind, said in (("ScheduledExecution", "wants its FMU run by ScheduledExecution"),
+                       ("ModelExchange", "offers co-simulation, not model exchange")):  # fmt: skip
+        wanted = part("a", more=f'implementation="{kind}"')
+        file = packaged(tmp_path / "x.ssp", fmus, system(wanted))
+        with pytest.raises(ConfigurationError, match=said):
+            read_ssp(file)
+
+
+def test_an_experiment_that_starts_later(tmp_path, fmus):
+    """From 5 s to 7 s: two seconds here, and the FMU is told 5 s, then 5.1 s."""
+    file = packaged(
+        tmp_path / "x.ssp", fmus, system(part("a")), experiment='startTime="5" stopTime="7"'
+    )
+    assert read_ssp(file).duration == 2
+    assert values(file, "a.time") == [5.0]
+    assert values(file, "a.time", t="0.1") == pytest.approx([5.1])
+
+
+def test_versions(tmp_path, fmus):
+    for version in ("1.0", "1.1-beta", "2.0"):
+        file = packaged(tmp_path / "x.ssp", fmus, system(part("a")), version=version)
+        assert values(file, "a.y") == [1.0]
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a")), version="3.0")
+    with pytest.raises(ConfigurationError, match=r"is of version 3.0 of SSP; terrafix reads 1.x"):
+        read_ssp(file)
+
+
+def test_the_system_itself_and_which_way_a_connection_goes(tmp_path, fmus):
+    """An empty element is the system, as an absent one; start and end are no direction."""
+    given = bindings(bound(k="4"))
+    backward = link("b.u", "a.y")
+    owned = (
+        '<ssd:Connection startElement="" startConnector="gain" endElement="b" endConnector="k"/>'
+    )
+    b = part("b", inside=connectors(u="input"))
+    top = system(
+        part("a", inside=connectors(y="output") + given) + b,
+        backward,
+        owned,
+        before=connectors(gain="parameter") + bindings(bound(gain="20")),
+    )
+    assert values(packaged(tmp_path / "x.ssp", fmus, top), "b.y") == [24.0]
+
+
+def test_a_state_that_starts_from_an_input_is_what_ecos_has(tmp_path, fmus):
+    """p.x(0) = 1, so q starts at 1, and is 1.1 after a step, 1.21 after two (x = 1 + t)."""
+    shown = part("p", "p", connectors(x="output")) + part(
+        "q", "q", connectors(u="input", y="output")
+    )
+    file = packaged(tmp_path / "x.ssp", fmus, system(shown, link("p.x", "q.u")))
+    here = [values(file, "q.y", t=t)[0] for t in ("0", "0.1", "0.2")]
+    assert here == pytest.approx([1.0, 1.1, 1.21], abs=1e-15)
+    code = ECOS.replace("step_size=0.01", "step_size=0.1")
+    there = [in_another_process("ecospy", code, file, n, "q::y")[0] for n in (1, 2)]
+    assert np.array_equal(there, here[1:])
+
+
+def test_prefixes_that_nobody_declared(tmp_path, fmus):
+    """As in packages of the Open Simulation Platform: read as everybody means them, and told."""
+    given = part("a", inside=bindings(bound(k="4")))
+    file = packaged(tmp_path / "x.ssp", fmus, system(given), declared=False)
+    assert values(file, "a.y") == [4.0]
+    assert (
+        "SystemStructure.ssd does not declare the prefixes ssv, ssc, osp: read as everybody means it"
+        in check(read_ssp(file)).notes
+    )
+
+
+def test_damaged_xml_is_named(tmp_path, fmus):
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a")) + "<ssd:open>")
+    with pytest.raises(ConfigurationError, match=r"SystemStructure.ssd is damaged: mismatched tag"):
+        read_ssp(file)
+
+
+def test_a_step_size_is_asked_for_by_name(tmp_path, fmus, capsys):
+    """Where neither package nor FMU gives one; one that is named overrules the package."""
+
+    def run(*words):
+        with pytest.raises(SystemExit) as done:
+            main([str(w) for w in words])
+        return done.value.code, capsys.readouterr()
+
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a") + part("b")), step="")
+    code, said = run("run", file, "--duration", "1", "--quiet")
+    assert code == 2
+    assert "give it one: --rate a=100Hz, or --rate 100Hz for all without one" in said.err
+    assert run("run", file, "--rate", "10Hz", "--duration", "1", "--quiet")[0] == 0
+    made = read_ssp(file, [("rate", "10 Hz"), ("b.period", "0.5 s")])
+    assert [float(made.nodes[n].rate.period) for n in "ab"] == [0.1, 0.5]
+    code, said = run("check", file, "--rate", "10Hz", "--rate", "c=5Hz")
+    assert (code, "--rate names 'c', which is no component" in said.err) == (2, True)
+    code, said = run("check", file, "--rate", "a=fast")
+    assert (code, "--rate a=fast" in said.err) == (2, True)
+    target = tmp_path / "x.toml"
+    assert run("ssp", "import", file, "--rate", "0.1s", "-o", target)[0] == 0
+    assert "0.1" in target.read_text()
+
+
+def test_a_package_within_a_package(tmp_path, fmus):
+    """What is bound to the component overrules the inner package's own: k 7, not 3."""
+    inner = system(
+        part("a", inside=bindings(bound(k="2"))),
+        link("a.y", "out"),
+        link("in", "a.u"),
+        before=connectors(**{"in": "input", "out": "output"}) + bindings(bound(a__k="3")),
+    )
+    held = packaged(tmp_path / "inner.ssp", fmus, inner).read_bytes()
+    component = (
+        '<ssd:Component name="B" type="application/x-ssp-package" source="in%20ner.ssp">'
+        + bindings(bound(a__k="7"))
+        + "</ssd:Component>"
+    )
+    top = system(component + part("c"), link("c.y", "B.in"), link("B.out", "c.u"))
+    file = packaged(tmp_path / "x.ssp", fmus, top, **{"in ner.ssp": held})
+    made = read_ssp(file)
+    assert sorted(map(str, made.connections)) == ["B_a.y -> c.u", "c.y -> B_a.u"]
+    file = packaged(tmp_path / "y.ssp", fmus, system(component), **{"in ner.ssp": held})
+    assert values(file, "B_a.y") == [7.0]
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ({"experiment": 'startTime="0" stopTime="soon"'}, "stopTime of its experiment is 'soon'"),
+        ({"experiment": 'startTime="5" stopTime="2"'}, "stops at 2 s and starts at 5 s"),
+        ({"step": STEP.replace('"0.1"', '"quick"')}, "FixedStepAlgorithm is 'quick', which is no"),
+    ],
+)
+def test_numbers_that_are_none(tmp_path, fmus, written, message):
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a")), **written)
+    with pytest.raises(ConfigurationError, match=message):
+        read_ssp(file)
+
+
+def test_what_is_wrong_with_an_fmu_names_the_package_and_not_a_temporary_folder(tmp_path):
+    file = packaged(tmp_path / "x.ssp", {"k": b"no archive"}, system(part("a")))
+    with pytest.raises(ConfigurationError, match=r"x.ssp': 'a': 'k.fmu' is no FMU"):
+        read_ssp(file)
