@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,10 +113,10 @@ class ForkError(TerrafixError):
 def _live_as_a_fork(functions: Callable[[], dict[str, Any]], requests: int, answers: int) -> None:
     """Answer requests, and end without what belongs to the process that was copied."""
     try:
-        low, high = sorted((requests, answers))
-        os.closerange(3, low)
-        os.closerange(low + 1, high)
-        os.closerange(high + 1, os.sysconf("SC_OPEN_MAX"))
+        handles = {int(path.name) for path in Path("/dev/fd").iterdir()}
+        for handle in handles - {0, 1, 2, requests, answers}:
+            with suppress(OSError):  # that of the list itself
+                os.close(handle)
         answer_requests(functions(), os.fdopen(requests, "rb"), os.fdopen(answers, "wb"))
     finally:
         os._exit(0)
