@@ -206,8 +206,11 @@ class Fmu(Settling):
 
     def _take_parameters_of_start(self) -> None:
         """Make values of ``start`` that are of parameters values of these."""
+        assert self._found is not None
         by_name = {q.name: n for n, q in self._quantities.items()}
         start = dict(self.given_parameters["start"])
+        for name in start.keys() & self._found[1].texts.keys():
+            self._check_text(name, start[name])
         beyond = {n for n, value in start.items() if self._is_beyond_doubles(n, value)}
         meant = {by_name[n]: n for n in start if n in by_name and n not in beyond}
         for own in self.in_order_of_setting(meant):
@@ -222,6 +225,12 @@ class Fmu(Settling):
             self._from_start |= {own}
             self.declare_settings()
         self.parameter_values["start"] = self.given_parameters["start"] = start
+
+    def _check_text(self, name: str, value: object) -> None:
+        if not isinstance(value, str):
+            raise ConfigurationError(
+                f"'{self.name}.start.{name}' is text, not {value!r}\n  write \"{value}\""
+            )
 
     def _is_beyond_doubles(self, name: str, value: object) -> bool:
         """Whether a whole number is one that a parameter, a double, does not hold.
@@ -334,10 +343,7 @@ class Fmu(Settling):
         self._texts: list[Start] = []
         for name, value in self.given_parameters["start"].items():
             if name in self.interface.texts:
-                if not isinstance(value, str):
-                    raise ConfigurationError(
-                        f"'{self.name}.start.{name}' is text, not {value!r}\n  write \"{value}\""
-                    )
+                self._check_text(name, value)
                 self._texts.append(Start(name, "String", (self.interface.texts[name],), (value,)))
                 continue
             if name not in known:
