@@ -242,7 +242,8 @@ class Fmu(Settling):
         """
         assert self._found is not None
         archive, quantity = self._found[1].archive, self._found[1].parameters.get(name)
-        if quantity is None or quantity.kind not in INTEGER or quantity.items:
+        kinds = (*INTEGER, *BOOLEAN) if isinstance(value, int | float) else INTEGER
+        if quantity is None or quantity.kind not in kinds or quantity.items:
             return False
         where = f"'{self.name}.start.{name}'"
         read = read_whole(value, quantity.kind, archive.version, quantity.shape, where=where)
