@@ -114,7 +114,8 @@ def test_a_reader_that_does_not_serve_is_named(
 
 def test_settings_do_not_reach_into_a_package(tmp_path):
     assert refusal(tmp_path / "coast.ssp", [("duration", "5")]) == (
-        f"--set does not reach into '{tmp_path}/coast.ssp'\n"
+        f"--set duration does not reach into '{tmp_path}/coast.ssp', of which step sizes alone can "
+        "be set\n"
         "  terrafix ssp import writes it as a system file, where everything can be set"
     )
     assert refusal(tmp_path / "coast.ssp") == f"there is no SSP package '{tmp_path}/coast.ssp'"
