@@ -142,20 +142,10 @@ class FleetApart:
         self._forks: dict[int, _Fork] = {}
         _prepare(setup)
 
-    def start(
-        self,
-        active: NDArray[np.bool_],
-        messages: Sequence[Message] = (),
-        known: Sequence[Group] | None = None,
-    ) -> Failures:
-        """As `Fleet.start`."""
-        self._fork(active)
-        one = np.ones(1, np.bool_)
-        return self._exchange("start", lambda row: (one, _for_one(messages, row), known))
-
     def enter(self, active: NDArray[np.bool_]) -> Failures:
         """As `Fleet.enter`."""
-        self._fork(active)
+        for row in np.flatnonzero(active).tolist():
+            self._forks[row] = _Fork(partial(_one_member, _of_one(self.setup, row)))
         return self._exchange("enter", lambda _: (np.ones(1, np.bool_),))
 
     def settle(self, known: Sequence[Group] | None, wanted: Sequence[Group]) -> Failures:
@@ -172,10 +162,6 @@ class FleetApart:
         return self._exchange(
             "leave", lambda row: (active[row : row + 1], _for_one(messages, row), known)
         )
-
-    def _fork(self, active: NDArray[np.bool_]) -> None:
-        for row in np.flatnonzero(active).tolist():
-            self._forks[row] = _Fork(partial(_one_member, _of_one(self.setup, row)))
 
     def step(
         self,
@@ -380,7 +366,8 @@ def _play(
         chosen = list(rows)
         fleet = Fleet(setup.of(chosen), len(rows))
         fleet.inputs[...] = inputs[chosen]
-        failures = fleet.start(np.ones(len(rows), np.bool_))
+        everybody = np.ones(len(rows), np.bool_)
+        failures = fleet.enter(everybody) | fleet.leave(everybody)
         found = [fleet.outputs.copy()]
         for k in range(STEPS):
             if moved:
@@ -446,7 +433,7 @@ def _fleet_functions(fleet: Any) -> dict[str, Any]:
         return call
 
     plain = ("save", "restore", "mark", "return_to_mark", "close")
-    exchanging = ("start", "enter", "settle", "leave", "step")
+    exchanging = ("enter", "settle", "leave", "step")
     return {name: exchange(name) for name in exchanging} | {
         name: getattr(fleet, name) for name in plain
     }

@@ -129,9 +129,9 @@ class _EventInfo2(ct.Structure):
 
 
 _messages: dict[int, list[str]] = {}
-HEARD: list[tuple[int, int, str]] = []
-"""What instances logged: of which environment, with which status, what; until a fleet takes it."""
-_MOST_HEARD = 1000
+HEARD: dict[int, list[tuple[int, str]]] = {}
+"""By environment, what an instance logged, status and text, until a fleet takes it."""
+_MOST_HEARD = 100
 
 
 def _note(environment: int | None, status: int, text: bytes | None) -> None:
@@ -139,8 +139,9 @@ def _note(environment: int | None, status: int, text: bytes | None) -> None:
     found = _messages.setdefault(environment or 0, [])
     if said and len(found) < 100:
         found.append(said)
-    if said and len(HEARD) < _MOST_HEARD:
-        HEARD.append((environment or 0, int(status), said))
+    heard = HEARD.setdefault(environment or 0, [])
+    if said and len(heard) < _MOST_HEARD:
+        heard.append((int(status), said))
 
 
 def _log_of_fmi2(environment: Any, name: Any, status: Any, category: Any, text: Any) -> None:
@@ -373,6 +374,7 @@ class Instance:
                 function(self.pointer)
             self.pointer = None
         _messages.pop(self._environment, None)
+        HEARD.pop(self._environment, None)
 
     # ------------------------------------------------------------------ variables
 

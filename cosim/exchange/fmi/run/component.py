@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Collection, Iterable, Sequence
 from fractions import Fraction
@@ -34,10 +33,9 @@ from terrafix.cosim.declare.ports import (
     Output,
     Port,
 )
-from terrafix.cosim.declare.settling import Settling
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
-from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE, STATUS
-from terrafix.cosim.exchange.fmi.run.fleet import Ended, Failures, Group, Message, Setup
+from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
+from terrafix.cosim.exchange.fmi.run.fleet import Group, Message, Setup
 from terrafix.cosim.exchange.fmi.run.parameters import (
     EXACT,
     STRUCTURAL,
@@ -58,17 +56,14 @@ from terrafix.cosim.exchange.fmi.run.reading import (
     read_interface,
 )
 from terrafix.cosim.exchange.fmi.run.solvers import SOLVERS
+from terrafix.cosim.exchange.fmi.run.telling import Telling
 from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, MOST, cells, read_whole
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.memory.messages import MessageReader
 from terrafix.cosim.memory.slots import BundleView
 
-_log = logging.getLogger(__name__)
-MOST_LOGGED = 20
-"""Messages of one FMU that are shown."""
 
-
-class Fmu(Settling):
+class Fmu(Telling):
     """A Functional Mock-up Unit, FMI 2 or 3, one instance for each member.
 
     Ports, units, arrays and start values are those of its model description, and so are parameters,
@@ -437,31 +432,28 @@ class Fmu(Settling):
         self._make_fleet()
         assert self._fleet is not None
         self._begun = True
-        self._tell(self._fleet.enter(self.environment.active.copy()))
+        self._tell(self._fleet, self._fleet.enter(self.environment.active.copy()))
 
     def settle(self, known: Iterable[str], outputs: Iterable[str]) -> None:
         """Set the inputs that are known and get some outputs, in initialization mode."""
         fleet, wanted = self._fleet, set(outputs)
         assert fleet is not None
-        groups = self._take_known(set(known))
-        self._tell(
-            fleet.settle(groups, [self._group(*k) for k in self._output_at if k[0] in wanted])
-        )
+        groups = [self._group(*k) for k in self._output_at if k[0] in wanted]
+        self._tell(fleet, fleet.settle(self._take_known(set(known)), groups))
         for port, target, source in self._results_of:
             if port in wanted:
                 target[...] = source
 
     def _initialize_impl(self) -> None:
         if not self._begun:
-            self._make_fleet()
-        fleet, active = self._fleet, self.environment.active.copy()
+            self.begin_start()
+        self._begun = False
+        fleet = self._fleet
         assert fleet is not None
         known = self.known_at_start
         groups = self._take_known(self.taken_at_start() if known is None else known)
-        messages = self._fresh_messages()
-        finish = fleet.leave if self._begun else fleet.start
-        self._begun = False
-        self._tell(finish(active, messages, groups))
+        active, messages = self.environment.active.copy(), self._fresh_messages()
+        self._tell(fleet, fleet.leave(active, messages, groups))
         for target, source in self._results:
             target[...] = source
         self._publish_messages()
@@ -634,44 +626,10 @@ class Fmu(Settling):
         now = t + self._start_time
         failures = fleet.step(self._t, now - self._t, messages, skipped)
         self._t = now
-        if said := fleet.take_log():
-            self._show_log(said, failures)
-        if failures:
-            self._report(failures)
+        self._tell(fleet, failures)
         for target, source in self._results:
             target[...] = source
         self._publish_messages()
-
-    def _tell(self, failures: Failures) -> None:
-        """Show what the FMU logged, and report failures."""
-        assert self._fleet is not None
-        if said := self._fleet.take_log():
-            self._show_log(said, failures)
-        self._report(failures)
-
-    def _show_log(self, said: Sequence[tuple[int, int, str]], failures: Failures) -> None:
-        """Show what the FMU logged, with the member; not what a failure quotes."""
-        for row, status, text in said:
-            if text in failures.get(row, ""):
-                continue
-            level = logging.WARNING if status > 0 else logging.INFO
-            self._logged += level == logging.WARNING
-            if level == logging.WARNING and self._logged > MOST_LOGGED:
-                continue
-            what = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
-            member = self.environment.members[row]
-            path = self.environment.path
-            _log.log(
-                level, "'%s', member %d, t = %.9g s: %s: %s", path, member, self._t, what, text
-            )
-            if level == logging.WARNING and self._logged == MOST_LOGGED:
-                _log.warning("'%s': further messages of this FMU are not shown", path)
-
-    def _report(self, failures: Failures) -> None:
-        for row, text in failures.items():
-            mask = np.zeros(self.n_members, dtype=np.bool_)
-            mask[row] = True
-            (self.end_run if isinstance(text, Ended) else self.fail)(mask, text)
 
     # ------------------------------------------------------------------ messages
 

@@ -250,30 +250,8 @@ class Fleet:
 
     # ------------------------------------------------------------------ life cycle
 
-    def start(
-        self,
-        active: NDArray[np.bool_],
-        messages: Sequence[Message] = (),
-        known: Sequence[Group] | None = None,
-    ) -> Failures:
-        """Instantiate and initialize the active members with what stands in `inputs`.
-
-        Only `known` inputs are set, if they are given. Afterwards `outputs` hold the values at the
-        start.
-        """
-
-        def start_one(row: int) -> None:
-            self._enter_one(row)
-            self._leave_one(row, messages, known)
-
-        failures = self._each(np.flatnonzero(active).tolist(), start_one)
-        self._active[:] = active
-        self._live = self._find_live()
-        self._prepare_calls()
-        return failures
-
     def enter(self, active: NDArray[np.bool_]) -> Failures:
-        """Instantiate the active members, enter initialization mode: the first half of `start`."""
+        """Instantiate the active members, and enter initialization mode."""
         self._active[:] = active
         failures = self._each(np.flatnonzero(active).tolist(), self._enter_one)
         self._live = self._find_live()
@@ -298,7 +276,10 @@ class Fleet:
         messages: Sequence[Message] = (),
         known: Sequence[Group] | None = None,
     ) -> Failures:
-        """Set `known` inputs and leave initialization mode: the second half of `start`."""
+        """Set inputs (those that are `known`, if given), and leave initialization mode.
+
+        Afterwards `outputs` hold the values at the start.
+        """
         self._active[:] &= active
         self._live = self._find_live()
         failures = self._each(self._live, lambda row: self._leave_one(row, messages, known))
@@ -529,10 +510,12 @@ class Fleet:
         """What the FMU logged since this was last asked: row, status as FMI numbers it, text."""
         if not HEARD:
             return ()
-        rows = {i.environment: row for row, i in enumerate(self.instances) if i is not None}
-        found = [(rows[e], status, text) for e, status, text in HEARD if e in rows]
-        HEARD[:] = [each for each in HEARD if each[0] not in rows]
-        return found
+        instances = ((row, i) for row, i in enumerate(self.instances) if i is not None)
+        return [
+            (row, status, text)
+            for row, instance in instances
+            for status, text in HEARD.pop(instance.environment, ())
+        ]
 
     # ------------------------------------------------------------------ state
 

@@ -18,17 +18,17 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, WiringError, nearest
 from terrafix.cosim.declare.parameters import Count, FileTable, Parameter, Text
 from terrafix.cosim.declare.ports import Capabilities, Input, Output, Port
-from terrafix.cosim.declare.settling import Settling
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION
 from terrafix.cosim.exchange.fmi.run.component import Fmu, grouped, usual_step
-from terrafix.cosim.exchange.fmi.run.fleet import Ended, Setup
+from terrafix.cosim.exchange.fmi.run.fleet import Setup
 from terrafix.cosim.exchange.fmi.run.places import AnyFleet, make_fleet
+from terrafix.cosim.exchange.fmi.run.telling import Telling
 from terrafix.cosim.system.wiring import check_connection, port_factor
 
 _CONNECTION = re.compile(r"\s*(\w+)\.(\w+)\s*->\s*(\w+)\.(\w+)\s*\Z")
 
 
-class FmuLoop(Settling):
+class FmuLoop(Telling):
     """Several FMUs for co-simulation, iterated in every step until their signals agree.
 
     Outputs are called ``a_y`` for output y of FMU a; inputs that are not connected within
@@ -117,7 +117,7 @@ class FmuLoop(Settling):
         self._make_fleets()
         self._begun = True
         for name, fleet in self._fleets.items():
-            self._report(name, fleet.enter(self.environment.active.copy()))
+            self._tell(fleet, fleet.enter(self.environment.active.copy()), name)
 
     def settle(self, known: Iterable[str], outputs: Iterable[str]) -> None:
         """Hand on outputs within, in initialization mode, until they stand still."""
@@ -127,7 +127,7 @@ class FmuLoop(Settling):
         for _ in range(max(most, len(self._parts) + 1)):
             for name, fleet in self._fleets.items():
                 groups = fleet.setup.inputs, fleet.setup.outputs
-                self._report(name, fleet.settle(*groups))
+                self._tell(fleet, fleet.settle(*groups), name)
             change = self._inside()
             wanting = (change > self.parameter_values["tolerance"]) & self.environment.active
             if not wanting.any():
@@ -143,7 +143,7 @@ class FmuLoop(Settling):
         known = self.known_at_start
         self.settle(self.taken_at_start() if known is None else known, ())
         for name, fleet in self._fleets.items():
-            self._report(name, fleet.leave(self.environment.active.copy()))
+            self._tell(fleet, fleet.leave(self.environment.active.copy()), name)
         self._inside()
         self._publish()
 
@@ -175,7 +175,7 @@ class FmuLoop(Settling):
             self._fleets[name] = fleet
             self.remarks += [remark] if remark else []
             fleet.inputs[...] = starts
-        self._t = 0.0
+        self._t, self._logged = 0.0, 0
 
     def _outside(self, *, finite: bool = False, known: Collection[str] | None = None) -> None:
         """Take the inputs that come from outside, or those that are known of them."""
@@ -206,9 +206,10 @@ class FmuLoop(Settling):
         for fleet in self._fleets.values():
             fleet.mark()
         tolerance = self.parameter_values["tolerance"]
+        before, self._t = self._t, t
         for _ in range(self.given_parameters["most_iterations"]):
             for name, fleet in self._fleets.items():
-                self._report(name, fleet.step(self._t, t - self._t, (), self._gone()))
+                self._tell(fleet, fleet.step(before, t - before, (), self._gone()), name)
             change = self._inside()
             wanting = (change > tolerance) & self.environment.active
             if not wanting.any():
@@ -218,7 +219,6 @@ class FmuLoop(Settling):
         else:
             most = self.given_parameters["most_iterations"]
             self.fail(wanting, f"signals did not settle in {most} repetitions of a step")
-        self._t = t
         self._publish()
 
     def _gone(self) -> list[int]:
@@ -231,13 +231,6 @@ class FmuLoop(Settling):
                 rows = self._fleets[name].outputs[:, self._at[name, port]]
                 view = self.port_views[f"{name}_{port}"]
                 view[...] = rows.reshape(view.shape)
-
-    def _report(self, name: str, failures: dict[int, str]) -> None:
-        for row, text in failures.items():
-            mask = np.zeros(self.n_members, dtype=np.bool_)
-            mask[row] = True
-            end = self.end_run if isinstance(text, Ended) else self.fail
-            end(mask, f"'{name}': {text}")
 
     # ------------------------------------------------------------------ state
 

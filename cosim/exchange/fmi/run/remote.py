@@ -243,15 +243,6 @@ class RemoteFleet:
         own_limit = limit if apart else None
         self._worker.call("make", setup, n_members, own_limit, limit=FIRST_LIMIT)
 
-    def start(
-        self,
-        active: NDArray[np.bool_],
-        messages: Sequence[Message] = (),
-        known: Sequence[Group] | None = None,
-    ) -> Failures:
-        """As `Fleet.start`."""
-        return self._exchange("start", active, messages, known)
-
     def enter(self, active: NDArray[np.bool_]) -> Failures:
         """As `Fleet.enter`."""
         return self._exchange("enter", active)

@@ -10,7 +10,10 @@ from small_fmus import Variable, small_fmu
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.engine.run import RunError, simulate
-from terrafix.cosim.exchange.fmi.run.component import MOST_LOGGED, Fmu
+from terrafix.cosim.exchange.fmi.run import binding
+from terrafix.cosim.exchange.fmi.run.component import Fmu
+from terrafix.cosim.exchange.fmi.run.loop import FmuLoop
+from terrafix.cosim.exchange.fmi.run.telling import MOST_LOGGED
 from terrafix.cosim.system.system import System
 
 
@@ -102,3 +105,37 @@ def test_what_a_failure_says_is_said_once_and_a_flood_ends(talker, caplog):
     assert len(lines) == MOST_LOGGED + 1
     assert lines[-1] == "'a': further messages of this FMU are not shown"
     assert not any("out of fuel" in line for line in lines)
+
+
+def test_the_log_of_an_fmu_of_a_loop_is_shown_with_its_name(tmp_path, caplog):
+    state = "".join(
+        f"EXPORT int fmi2{n}(void *m, void *s) {{ return 0; }}"
+        for n in ("GetFMUstate", "SetFMUstate", "FreeFMUstate")
+    )
+    file = small_fmu(
+        tmp_path / "t.fmu",
+        2,
+        [Variable("y", start="0.0"), Variable("u", causality="input", start="0.0")],
+        step='say(m, 1, "low on fuel");',
+        interface=' canGetAndSetFMUstate="true"',
+        globals_=state,
+    )
+    system = System("s")
+    system.add(FmuLoop(files={"pump": file}, connect="pump.y -> pump.u", rate=Rate("0.1")), "a")
+    simulate(system, duration="0.2")
+    assert said(caplog) == [
+        f"'a.pump', member 0, t = {t} s: Warning: low on fuel" for t in ("0.1", "0.2")
+    ]
+
+
+def test_an_instance_that_nobody_hears_silences_no_other(talker, caplog):
+    for _ in range(5000):
+        binding._log_of_fmi2(-1, b"other", 1, b"", b"a flood")
+    try:
+        system = System("s")
+        system.add(Fmu(file=talker(2), rate=Rate("0.1")), "a")
+        simulate(system, members=2, duration="0.1")
+        assert said(caplog) == ["'a', member 1, t = 0.1 s: Warning: low on fuel"]
+        assert len(binding.HEARD[-1]) <= 100
+    finally:
+        del binding.HEARD[-1]
