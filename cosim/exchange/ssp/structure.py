@@ -1,0 +1,441 @@
+"""What an SSP package says: its components, how they are connected, and what they are set to.
+
+Systems within systems, and packages within packages, are followed down to components. Values that
+are set at a connector of a system go to all that are connected to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from urllib.parse import unquote
+from xml.etree import ElementTree as ET
+
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError, nearest
+from terrafix.cosim.basics.units import SI_BASE, unit_by_definition, unit_by_name
+from terrafix.cosim.exchange.fmi.run.archive import unpack
+from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
+from terrafix.cosim.exchange.ssp.documents import read_document
+from terrafix.cosim.exchange.ssp.names import OSP, OWN, SSC, SSD, SSM, SSV, tag
+from terrafix.cosim.exchange.ssp.parameters import (
+    Transformation,
+    Value,
+    exact,
+    mapped,
+    read_set,
+    transformation,
+)
+
+STRUCTURE = "SystemStructure.ssd"
+MOST_WITHIN = 10
+_SYSTEM_TYPES = ("application/x-ssp-package", "application/x-ssp-definition")
+VERSIONS = ("1.", "2.0")
+_KINDS = {"any": "auto", "CoSimulation": CO_SIMULATION, "ModelExchange": MODEL_EXCHANGE}
+_SOURCES = {True: ("input", "parameter", "inout"), False: ("output", "calculatedParameter")}
+"""Kinds of connectors that a connection comes from: of the system itself, and of its elements."""
+End = tuple[str, str]
+"""Component and connector."""
+
+
+@dataclass
+class Link:
+    """A scalar connection between two components, with what happens on the way."""
+
+    source: End
+    target: End
+    factor: float = 1.0
+    offset: float = 0.0
+    converted: bool = True
+
+    @property
+    def plain(self) -> bool:
+        """Whether nothing happens on the way."""
+        return (self.factor, self.offset) == (1.0, 0.0)
+
+
+@dataclass
+class Part:
+    """A component of the package."""
+
+    name: str
+    source: Path
+    kind: str = "auto"
+    starts: dict[str, Value] = field(default_factory=dict)
+    rate: Rate | None = None
+    units: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class Joint:
+    """A connection as it is written, between connectors of elements or of their system."""
+
+    source: End
+    target: End
+    step: Transformation
+    keep_unit: bool = True
+
+
+@dataclass
+class Structure:
+    """What is found in a package.
+
+    Attributes
+    ----------
+    parts : dict of str to Part
+    joints : list of Joint
+    elements : dict of str to dict
+        Elements of each system by name: components by their name here, systems by their key.
+    kinds : dict of End to str
+        Kinds of the connectors of systems.
+    links : list of Link
+    inputs : dict of str to list of Link
+        Readers of what the outermost system is given.
+    outputs : dict of str to End
+    """
+
+    parts: dict[str, Part] = field(default_factory=dict)
+    joints: list[Joint] = field(default_factory=list)
+    elements: dict[str, dict[str, str]] = field(default_factory=dict)
+    kinds: dict[End, str] = field(default_factory=dict)
+    links: list[Link] = field(default_factory=list)
+    inputs: dict[str, list[Link]] = field(default_factory=dict)
+    outputs: dict[str, End] = field(default_factory=dict)
+
+
+class Gathering:
+    """Reads the documents of a package.
+
+    Parameters
+    ----------
+    file : Path
+        For messages.
+    folder : Path
+        Where it was unpacked.
+    root : Element
+        Of its description.
+
+    Attributes
+    ----------
+    notes : list of str
+        What is remarkable about it.
+    """
+
+    def __init__(self, file: Path, folder: Path, root: ET.Element) -> None:
+        self.notes: list[str] = []
+        self._file, self._folder = file, folder
+        self._units_of = root  # whose units are meant
+        self._within: list[str] = []
+
+    def note_undeclared(self, name: str, missing: Sequence[str]) -> None:
+        """Keep in mind that a document uses prefixes that it does not declare."""
+        if missing:
+            self.notes.append(
+                f"{name} does not declare the prefix{'es' * (len(missing) > 1)} "
+                f"{', '.join(missing)}: read as everybody means it"
+            )
+
+    def structure(self, top: ET.Element) -> Structure:
+        """Components and connections of a system, following systems within down to components."""
+        into = Structure()
+        self._gather(top, "", "", into)
+        incoming = {j.target: j for j in into.joints}
+        for joint in into.joints:
+            if joint.target[0] not in into.parts:
+                continue
+            steps, origin, converted = [joint.step], joint.source, joint.keep_unit
+            seen = {joint.target}
+            while origin[0] not in into.parts and origin in incoming and origin not in seen:
+                seen.add(origin)
+                steps.append(incoming[origin].step)
+                converted &= incoming[origin].keep_unit
+                origin = incoming[origin].source
+            factor, offset = self._linear(joint, steps)
+            link = Link(origin, joint.target, factor, offset, converted)
+            if origin[0] in into.parts:
+                into.links.append(link)
+            elif origin[0] == "":
+                into.inputs.setdefault(origin[1], []).append(link)
+        for (owner, name), kind in into.kinds.items():
+            if owner or kind != "output" or ("", name) not in incoming:
+                continue
+            origin, seen = incoming["", name].source, set[End]()
+            while origin[0] not in into.parts and origin in incoming and origin not in seen:
+                seen.add(origin)
+                origin = incoming[origin].source
+            if origin[0] in into.parts:
+                into.outputs[name] = origin
+        return into
+
+    def _linear(self, joint: Joint, steps: Sequence[Transformation]) -> tuple[float, float]:
+        """Several transformations as one; the first is that of the last link."""
+        gain, shift = 1.0, 0.0
+        for step in steps:
+            if step.table:
+                raise ConfigurationError(
+                    f"'{self._file}': the connection to '{joint.target[1]}' maps values by a "
+                    "table; terrafix reads linear transformations of connections"
+                )
+            gain, shift = gain * step.factor, gain * step.offset + shift
+        return gain, shift
+
+    def _gather(self, system: ET.Element, key: str, prefix: str, into: Structure) -> None:
+        names = into.elements[key] = {}
+        kinds: dict[End, str] = {}
+        for connector in _children(system, "Connectors", "Connector"):
+            into.kinds[key, str(connector.get("name"))] = str(connector.get("kind"))
+        elements = system.find(tag(SSD, "Elements"))
+        for element in elements if elements is not None else ():
+            kind = element.tag.rpartition("}")[2]
+            name = str(element.get("name"))
+            if name in names:
+                raise ConfigurationError(
+                    f"'{self._file}': system '{system.get('name')}' has two elements '{name}'\n"
+                    "  rename one of them"
+                )
+            full = self._free(f"{prefix}{name}", into)
+            if kind == "Component" and element.get("type") in _SYSTEM_TYPES:
+                names[name] = f"system {full}"
+                self._gather_within(element, names[name], f"{full}_", into)
+            elif kind == "Component":
+                names[name] = full
+                into.parts[full] = self._part(full, element)
+            elif kind == "System":
+                names[name] = f"system {full}"
+                self._gather(element, names[name], f"{full}_", into)
+            else:
+                raise ConfigurationError(
+                    f"'{self._file}' has a {kind} '{name}', which terrafix does not read"
+                )
+            for connector in _children(element, "Connectors", "Connector"):
+                kinds[names[name], str(connector.get("name"))] = str(connector.get("kind"))
+        for connection in _children(system, "Connections", "Connection"):
+            into.joints.append(self._joint(connection, key, names, kinds, into))
+        for name, value in self._values(system).items():
+            self._set(into, key, name, value)
+
+    def _gather_within(self, element: ET.Element, key: str, prefix: str, into: Structure) -> None:
+        """Gather the system of another package or description, as if it stood here.
+
+        What is bound to the component overrules what is bound to that system.
+        """
+        given = self._values(element)
+        source, folder = self._resource(element.get("source") or ""), self._folder
+        outer = self._units_of
+        if len(self._within) >= MOST_WITHIN:
+            raise ConfigurationError(
+                f"'{self._file}': more than {MOST_WITHIN} packages lie within each other"
+            )
+        document = source
+        if element.get("type") == _SYSTEM_TYPES[0]:
+            self._folder = folder / f"{prefix}package"
+            unpack(source, self._folder, "SSP package")
+            document = self._folder / STRUCTURE
+        try:
+            if not document.is_file():
+                raise ConfigurationError(f"'{self._file}': '{source.name}' has no {STRUCTURE}")
+            root, missing = read_document(document, self._file)
+            self.note_undeclared(document.name, missing)
+            check_version(self._file, document.name, root)
+            system = root.find(tag(SSD, "System"))
+            if system is None:
+                raise ConfigurationError(f"'{self._file}': '{source.name}' describes no system")
+            self._within.append(key)
+            self._units_of = root
+            self._gather(system, key, prefix, into)
+            self._within.pop()
+        finally:
+            self._folder, self._units_of = folder, outer
+        for name, value in given.items():
+            self._set(into, key, name, value)
+
+    @staticmethod
+    def _free(name: str, into: Structure) -> str:
+        """An identifier for an element, unlike those of the others."""
+        taken = {*into.parts, *(key.removeprefix("system ") for key in into.elements)}
+        base = full = identifier(name)
+        k = 1
+        while full in taken:
+            k += 1
+            full = f"{base}_{k}"
+        return full
+
+    def _joint(
+        self,
+        connection: ET.Element,
+        key: str,
+        names: Mapping[str, str],
+        kinds: Mapping[End, str],
+        into: Structure,
+    ) -> Joint:
+        ends: list[End] = []
+        for side in ("start", "end"):
+            owner = connection.get(f"{side}Element") or None
+            connector = str(connection.get(f"{side}Connector"))
+            if owner is not None and owner not in names:
+                raise ConfigurationError(
+                    f"'{self._file}' connects '{owner}.{connector}', but there is no '{owner}'\n"
+                    f"  {nearest(owner, names, what='elements')}"
+                )
+            ends.append((key if owner is None else names[owner], connector))
+        known = [kinds.get(e) if e[0] != key else into.kinds.get(e) for e in ends]
+        gives = [k is not None and k in _SOURCES[e[0] == key]
+                 for k, e in zip(known, ends, strict=True)]  # fmt: skip
+        if gives == [False, True] and known[0] is not None:
+            ends.reverse()  # start and end do not say which way it goes
+        keep = connection.get("suppressUnitConversion", "false") not in ("true", "1")
+        step = transformation(connection, f"'{self._file}': the connection to '{ends[1][1]}'")
+        return Joint(ends[0], ends[1], step, keep)
+
+    def _set(
+        self,
+        into: Structure,
+        owner: str,
+        name: str,
+        value: Value,
+        passed: frozenset[End] = frozenset(),
+    ) -> None:
+        """Set what a hierarchical name means; what is set later overrules what was set before."""
+        readers = [j for j in into.joints if j.source == (owner, name)]
+        if owner in into.parts:
+            into.parts[owner].starts[name] = value
+        elif (owner, name) in into.kinds or readers:
+            for joint in readers:
+                if joint.target not in passed:
+                    there = value.through(joint.step, keep_unit=joint.keep_unit)
+                    self._set(into, *joint.target, there, passed | {joint.target})
+        else:
+            elements = into.elements.get(owner, {})
+            inside = [e for e in elements if name.startswith(f"{e}.")]
+            if inside:
+                element = max(inside, key=len)
+                self._set(into, elements[element], name[len(element) + 1 :], value)
+
+    def _part(self, name: str, element: ET.Element) -> Part:
+        kind = element.get("type", "application/x-fmu-sharedlibrary")
+        source = element.get("source") or ""
+        if kind != "application/x-fmu-sharedlibrary":
+            raise ConfigurationError(
+                f"'{self._file}': component '{name}' is of type {kind}; terrafix reads FMUs "
+                "and packages of them"
+            )
+        wanted = element.get("implementation", "any")
+        if wanted not in _KINDS:
+            raise ConfigurationError(
+                f"'{self._file}': component '{name}' wants its FMU run by {wanted}; terrafix runs "
+                "CoSimulation and ModelExchange"
+            )
+        part = Part(name, self._resource(source), _KINDS[wanted])
+        part.starts = self._values(element)
+        for connector in _children(element, "Connectors", "Connector"):
+            unit = next((c.get("unit") for c in connector if c.get("unit")), None)
+            if unit is not None:
+                part.units[str(connector.get("name"))] = self._unit(unit)
+        rate = next(element.iter(tag(OWN, "Rate")), None)
+        if rate is not None:
+            times = rate.get("times")
+            part.rate = (
+                Rate(times=times.split())
+                if times is not None
+                else Rate(rate.get("period"), offset=rate.get("offset") or "0")
+            )
+        else:
+            hint = next(element.iter(tag(OSP, "StepSizeHint")), None)
+            if hint is not None and hint.get("value"):
+                step = exact(str(hint.get("value")), f"'{self._file}': StepSizeHint of '{name}'")
+                part.rate = Rate(step.limit_denominator(10**9))
+        return part
+
+    def _unit(self, name: str, parameters: ET.Element | None = None) -> str:
+        """A unit as the parameter set, or else the package, defines it.
+
+        A base unit without any exponent is what tools write of units that they do not know, since
+        the schema asks for one.
+        """
+        for place, group in ((parameters, SSV), (self._units_of, SSD)):
+            units = None if place is None else place.find(tag(group, "Units"))
+            for unit in () if units is None else units.findall(tag(SSC, "Unit")):
+                base = unit.find(tag(SSC, "BaseUnit"))
+                if unit.get("name") == name and base is not None and base.attrib:
+                    powers = {symbol: int(base.get(symbol, "0")) for symbol in SI_BASE}
+                    factor, offset = (
+                        float(base.get(*a)) for a in (("factor", "1"), ("offset", "0"))
+                    )
+                    return unit_by_definition(name, factor, powers, offset)
+        return unit_by_name(name)
+
+    def _values(self, element: ET.Element) -> dict[str, Value]:
+        """Values that the bindings of an element give; the later overrule the earlier."""
+        found: dict[str, Value] = {}
+        for binding in _children(element, "ParameterBindings", "ParameterBinding"):
+            kind = binding.get("type", "application/x-ssp-parameter-set")
+            where = f"'{self._file}': '{element.get('name')}'"
+            if kind != "application/x-ssp-parameter-set":
+                raise ConfigurationError(
+                    f"{where} has parameters of type {kind}; terrafix reads .ssv"
+                )
+            parameters = self._document(binding, tag(SSV, "ParameterSet"), where)
+            if parameters is None:
+                continue
+            values = {
+                name: replace(
+                    value, unit=self._unit(value.unit, parameters) if value.unit else None
+                )
+                for name, value in read_set(parameters, binding.get("prefix", "")).items()
+            }
+            mapping = binding.find(tag(SSD, "ParameterMapping"))
+            if mapping is not None:
+                entries = self._document(mapping, tag(SSM, "ParameterMapping"), where)
+                values = values if entries is None else mapped(values, entries, where)
+            found |= values
+        return found
+
+    def _document(self, binding: ET.Element, name: str, where: str) -> ET.Element | None:
+        """What a binding or mapping refers to, or holds itself."""
+        source = binding.get("source")
+        if not source:
+            held = binding.find(tag(SSD, "ParameterValues"))
+            return next((binding if held is None else held).iter(name), None)
+        if binding.get("sourceBase", "SSD") != "SSD":
+            raise ConfigurationError(
+                f"{where}: '{source}' lies inside the component\n"
+                "  terrafix reads parameters that lie in the package: move it there"
+            )
+        root, missing = read_document(self._resource(source), self._file)
+        self.note_undeclared(source, missing)
+        if root.tag != name:
+            raise ConfigurationError(
+                f"{where}: '{source}' is no {name.rpartition('}')[2]} of SSP 1.0"
+            )
+        check_version(self._file, source, root)
+        return root
+
+    def _resource(self, source: str) -> Path:
+        path = (self._folder / source.removeprefix("file:")).resolve()
+        if not path.is_file():
+            path = (self._folder / unquote(source.removeprefix("file:"))).resolve()
+        if not path.is_relative_to(self._folder.resolve()) or not path.is_file():
+            raise ConfigurationError(f"'{self._file}' names '{source}', which is not in it")
+        return path
+
+
+def check_version(file: Path, name: str, root: ET.Element) -> None:
+    """Refuse a version of SSP that is not known."""
+    version = root.get("version", "1.0")
+    if not version.startswith(VERSIONS):
+        raise ConfigurationError(
+            f"'{file}': {name} is of version {version} of SSP; terrafix reads 1.x and 2.0\n"
+            "  ask the tool that wrote it for one of these"
+        )
+
+
+def _children(element: ET.Element, group: str, name: str) -> list[ET.Element]:
+    parent = element.find(tag(SSD, group))
+    return [] if parent is None else parent.findall(tag(SSD, name))
+
+
+def identifier(name: str) -> str:
+    """What a name is called in a system."""
+    made = "".join(c if c.isalnum() and c.isascii() else "_" for c in name).strip("_") or "system"
+    return made if made[0].isalpha() else f"s_{made}"
