@@ -39,4 +39,4 @@ class Settling(Component):
 
     def settle(self, known: Iterable[str], outputs: Iterable[str]) -> None:
         """Take the inputs that are known, and publish some outputs; may be repeated."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must provide settle(known, outputs)")
