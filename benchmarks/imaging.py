@@ -95,7 +95,8 @@ def speed() -> None:
     one = seconds(lambda: curve.at(7062 + next(offsets)))
     floor = seconds(lambda: fft.ifft(domain.spectrum, axis=0, workers=-1))
     print(
-        f"autofocus candidate, 1024 x 1024: {one:.3f} s of processor (< 0.15), {one / floor:.1f} x its FFT"
+        f"autofocus candidate, 1024 x 1024: {one:.3f} s of processor (< 0.15), "
+        f"{one / floor:.1f} x its FFT"
     )
 
 
