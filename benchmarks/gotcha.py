@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix.components.sensors.pulses import pulse_sums
+from terrafix.components.sensors.compiled import pulse_sums
 from terrafix.models.core.arrays import Single
 from terrafix.models.images.aperture_matching import recognized
 from terrafix.models.radar.compensation import straight_line

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from terrafix.components.fields import ACQUISITION, ECHO, ESTIMATE, IMAGE, RADAR
+from terrafix.components.sensors.compiled import row_operations
 from terrafix.components.shared import require_common
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
@@ -110,6 +111,7 @@ class ImageFormer(Component):
                 migration_step=float(self.migration_step[k]),
                 band=(float(self.band[k, 0]), float(self.band[k, 1])),
                 exposure=float(self.exposure[k]),
+                operations=row_operations(),
             )
             self._form(t, imager, fresh)
         except ValueError as error:

@@ -13,6 +13,7 @@ import numpy as np
 from terrafix.components.fields import AMPLITUDE, GRID, HEIGHT, PLACES, RADAR, SURFACE, TIES
 from terrafix.components.ground import OnGround
 from terrafix.components.sensors.aperture import MARK
+from terrafix.components.sensors.compiled import row_operations
 from terrafix.components.sensors.files import (
     file_of_step,
     read_lines,
@@ -301,6 +302,7 @@ class RecordedReference(_Reference):
                 step=float(step),
                 band=(float(band[0]), float(band[1])),
                 exposure=float(exposure),
+                operations=row_operations(),
             )
             centroid = unwrapped_centroid(
                 imager.fraction, radar.prf, beam.doppler(radar.wavelength)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from terrafix.components.fields import PHASE, SPOTLIGHT_FIX, TRACK_ERROR
-from terrafix.components.sensors.pulses import pulse_sums
+from terrafix.components.sensors.compiled import pulse_sums
 from terrafix.components.shared import require_common
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.component import Component

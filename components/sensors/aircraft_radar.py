@@ -7,8 +7,8 @@ import numpy as np
 from terrafix.components.fields import GRID, HEIGHT, PULSES, SURFACE
 from terrafix.components.ground import OnGround, height_in_swath
 from terrafix.components.sensors.aperture import MARK
+from terrafix.components.sensors.compiled import pulse_sums
 from terrafix.components.sensors.echo import SendsChirps
-from terrafix.components.sensors.pulses import pulse_sums
 from terrafix.components.shared import generator, shared_setting
 from terrafix.components.truth.terrain import scene_from
 from terrafix.cosim.basics.arrays import FloatArray

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.components.fields import ACQUISITION, ECHO, GRID, HEIGHT, RADAR, SURFACE
+from terrafix.components.sensors.compiled import row_operations
 from terrafix.components.sensors.files import (
     file_of_step,
     read_lines,
@@ -175,7 +176,11 @@ class SceneEcho(_Echo):
             )
             scene = scene_from(self.height, self.grid, self.surface)
             snr = float(common(self, "snr"))
-            echo = simulated_echo(scene, arc, acquisition, generator(self), snr_db=snr)
+            echo = simulated_echo(
+                *(scene, arc, acquisition, generator(self)),
+                snr_db=snr,
+                operations=row_operations(),
+            )
         except ValueError as error:
             raise ConfigurationError(f"'{self.name}' cannot simulate its echo: {error}") from error
         self._publish(t, echo, first_time, near)

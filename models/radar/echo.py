@@ -44,8 +44,8 @@ from terrafix.models.motion.sampled import Arc
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Radar, chirp_replica, unit_phasor
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.history import RangeHistories, range_derivatives
-from terrafix.models.radar.resampling import stretched
 from terrafix.models.radar.scene import Scene
+from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
 _TAPS = 12
 
@@ -109,6 +109,7 @@ def simulated_echo(
     rng: np.random.Generator,
     *,
     snr_db: float = 10.0,
+    operations: Rows = ARRAY_ROWS,
 ) -> ComplexArray:
     """Raw echo of a scene: speckle, bright points, thermal noise.
 
@@ -122,6 +123,8 @@ def simulated_echo(
         Of speckle and noise.
     snr_db : float
         Ratio of the echo of mean clutter to thermal noise [dB].
+    operations : Rows
+        Who turns and resamples rows; `terrafix.components.sensors.compiled` has quicker ones.
 
     Returns
     -------
@@ -135,7 +138,7 @@ def simulated_echo(
     layers = [np.zeros((footprint.n_lines, footprint.n_cells), np.complex64) for _ in range(2)]
     _speckle(layers, terrain, heights, rng)
     _bright_points(layers, terrain, scene, heights)
-    echo = received(layers, heights, footprint, acquisition, grid_lines)
+    echo = received(layers, heights, footprint, acquisition, grid_lines, operations)
     aperture = acquisition.illuminated / _doppler_rate(footprint)
     noise = np.sqrt(0.5 * radar.n_pulse * aperture * radar.prf * 10 ** (-snr_db / 10))
     _add_noise(echo, noise, rng)
@@ -333,6 +336,7 @@ def received(
     footprint: Footprint,
     acquisition: Acquisition,
     first_line: int,
+    operations: Rows = ARRAY_ROWS,
 ) -> ComplexArray:
     """Echo of scatterers on the grid of a footprint, as an acquisition receives it.
 
@@ -347,6 +351,8 @@ def received(
     acquisition : Acquisition
     first_line : int
         Line of the grid that is the acquisition's first.
+    operations : Rows
+        Who turns and resamples rows.
     """
     radar = acquisition.radar
     n_lines, n_cells = layers[0].shape
@@ -370,16 +376,16 @@ def received(
 
     def compress_inversely(rows: slice) -> None:
         x = middle.clipped(radar.wavelength * frequency[rows])
-        low, high = (
-            spectra[k][rows] * unit_phasor(scale * (histories[k].at(x) @ by_range)) for k in (0, 1)
-        )
+        low, high = (spectrum[rows] for spectrum in spectra)
+        for part, history in ((low, histories[0]), (high, histories[1])):
+            operations.turn_by(part, scale * (history.at(x) @ by_range))
         low += high
         low *= (weight[rows] * lit[rows]).astype(np.float32)[:, None]
         total[rows] = low
 
     over([rows for rows in batches(n_lines) if lit[rows].any()], compress_inversely)
     spectra.clear()
-    _migrate(total, frequency, lit, middle, ranges, radar)
+    _migrate(total, radar.wavelength * frequency, lit, middle, ranges, operations)
     total = fft.fft(total, axis=1, overwrite_x=True, workers=-1)
     pulse = fft.fft(chirp_replica(radar), n_cells).astype(np.complex64) * unit_phasor(-0.125)
     f_r = fft.fftfreq(n_cells, 1 / radar.sample_rate)
@@ -389,7 +395,7 @@ def received(
         own = scale * middle.middle(radar.wavelength * f)
         cycles = 2 * (radar.carrier + f_r) / SPEED_OF_LIGHT
         cycles = cycles * middle.middle(SPEED_OF_LIGHT * f / (radar.carrier + f_r)) - own
-        total[rows] *= unit_phasor(cycles)
+        operations.turn_by(total[rows], cycles)
         total[rows] *= pulse
 
     over([rows for rows in batches(n_lines) if lit[rows].any()], send)
@@ -406,20 +412,19 @@ def _scaled_to(x: FloatArray, span: FloatArray) -> FloatArray:
 
 def _migrate(
     spectrum: ComplexArray,
-    frequency: FloatArray,
+    x: FloatArray,
     lit: FloatArray,
     history: RangeHistories,
     ranges: FloatArray,
-    radar: Radar,
+    operations: Rows,
 ) -> None:
     """Move ranges other than the middle one by what their migration differs from its."""
-    x = history.clipped(radar.wavelength * frequency)
+    x = history.clipped(x)
     ends = [-g(x) + x * g.deriv()(x) for g in (history.g[0], history.g[-1])]
     stretch = (ends[1] - ends[0]) / (history.ranges[-1] - history.ranges[0])
-    offset = ranges - np.mean(history.span)
+    origin = float((np.mean(history.span) - ranges[0]) / (ranges[1] - ranges[0]))
 
     def move(rows: slice) -> None:
-        moved = stretched(spectrum[rows], offset, -stretch[rows], radar.range_spacing)
-        spectrum[rows] = moved
+        spectrum[rows] = operations.stretched(spectrum[rows], origin, -stretch[rows])
 
     over([rows for rows in batches(len(spectrum), 256) if lit[rows].any()], move)

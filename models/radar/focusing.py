@@ -47,10 +47,11 @@ from terrafix.models.radar.chirp import (
     Window,
     compression_filter,
     padded_length,
-    unit_phasor,
 )
-from terrafix.models.radar.resampling import stretched
+from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
+_ROWS = 128
+"""Of a batch whose range is compressed: few enough to stay in the cache."""
 _SAMPLES = 2**14
 """Of a batch at least: what handing it to a thread costs is little of what it takes."""
 
@@ -97,6 +98,8 @@ class RangeDoppler:
     radar : Radar
     velocity_slope : float
         How much the effective velocity grows with range [m/s per m].
+    operations : Rows
+        Who turns rows of the spectrum.
     """
 
     spectrum: ComplexArray
@@ -109,6 +112,7 @@ class RangeDoppler:
     columns: slice
     radar: Radar
     velocity_slope: float = 0.0
+    operations: Rows = ARRAY_ROWS
 
     @property
     def duration(self) -> float:
@@ -224,6 +228,7 @@ def range_doppler(
     n_doppler: int | None = None,
     velocity_slope: float = 0.0,
     compressed: bool = False,
+    operations: Rows = ARRAY_ROWS,
 ) -> RangeDoppler:
     """Compress in range and remove range-cell migration, once for all azimuth compressions.
 
@@ -252,6 +257,8 @@ def range_doppler(
         How much the effective velocity grows with range [m/s per m]; azimuth compression heeds it.
     compressed : bool
         Whether `echo` is compressed in range: its pulse is then one cell long.
+    operations : Rows
+        Who turns and resamples rows; `terrafix.components.sensors.compiled` has quicker ones.
 
     Raises
     ------
@@ -267,10 +274,7 @@ def range_doppler(
     if n_doppler < n_lines:
         raise ValueError(f"a transform of {n_doppler} is shorter than an echo of {n_lines} lines")
     n_fft = int(fft.next_fast_len(n_cells)) if compressed else padded_length(radar, n_cells)
-    spectrum = fft.fft(echo.astype(np.complex64, copy=False), n_fft, axis=1, workers=-1)
-    if not compressed:
-        spectrum *= compression_filter(radar, n_fft, window)
-    spectrum = fft.fft(spectrum, n_doppler, axis=0, overwrite_x=True, workers=-1)
+    lines = fft.fft(echo.astype(np.complex64, copy=False), n_doppler, axis=0, workers=-1)
 
     frequency = fft.fftfreq(n_doppler, 1 / radar.prf)
     frequency += radar.prf * np.rint((centroid - frequency) / radar.prf)
@@ -282,24 +286,24 @@ def range_doppler(
     slant_range = np.asarray(near_range + spacing * (np.arange(n_cells) - n_shift), np.float64)
     reference = near_range * d_center + spacing * (n_cells - n_pulse) / 2
     f_r = fft.fftfreq(n_fft, 1 / radar.sample_rate)
+    squared, rest = (radar.carrier + f_r) ** 2, f_r * (1 + n_shift * spacing / reference)
     transverse = (SPEED_OF_LIGHT * frequency / (2 * velocity)) ** 2
+    factor = np.ones(n_fft, np.complex64)
+    if not compressed:
+        factor = compression_filter(radar, n_fft, window)
+    subtracted, stretch = radar.carrier * d, 1 / d - 1
+    origin = (reference - slant_range[0]) / spacing
 
-    def without_migration(rows: slice) -> None:
-        root = np.sqrt((radar.carrier + f_r) ** 2 - transverse[rows, None])
-        root -= radar.carrier * d[rows, None]
-        root -= f_r * (1 + n_shift * spacing / reference)
-        spectrum[rows] *= unit_phasor((2 * reference / SPEED_OF_LIGHT) * root)
+    def straighten(batch: slice) -> None:
+        spectrum = fft.fft(lines[batch], n_fft, axis=1)
+        operations.straighten(
+            *(spectrum, factor, squared, transverse[batch], subtracted[batch], rest),
+            2 * reference / SPEED_OF_LIGHT,
+        )
+        spectrum = fft.ifft(spectrum, axis=1, overwrite_x=True)
+        lines[batch] = operations.stretched(spectrum[:, :n_cells], origin, stretch[batch])
 
-    over(batches(n_doppler), without_migration)
-    spectrum = fft.ifft(spectrum, axis=1, overwrite_x=True, workers=-1)
-    stretch = 1 / d - 1
-    straight = np.empty((n_doppler, n_cells), np.complex64)
-
-    def stretch_rows(rows: slice) -> None:
-        offset = slant_range - reference
-        straight[rows] = stretched(spectrum[rows, :n_cells], offset, stretch[rows], spacing)
-
-    over(batches(n_doppler, 256), stretch_rows)
+    over(batches(n_doppler, _ROWS), straighten)
 
     in_band = np.abs(frequency - centroid) <= radar.doppler_bandwidth / 2
     first = near_range * d[in_band].max()
@@ -309,7 +313,7 @@ def range_doppler(
         slant_range, first, last, "the scene is too small: no column is seen by a whole pulse"
     )
     return RangeDoppler(
-        straight,
+        lines,
         frequency,
         slant_range,
         first_time,
@@ -319,6 +323,7 @@ def range_doppler(
         columns,
         radar,
         velocity_slope,
+        operations,
     )
 
 
@@ -379,12 +384,11 @@ def _compressed(
     weights = get_window(window, len(rows), fftbins=False).astype(np.float32)
     data = np.zeros_like(domain.spectrum)
 
+    steep, constant = (2 / radar.wavelength) * (d - 1), f * shift
+
     def compress(batch: slice) -> None:
-        cycles = (2 / radar.wavelength) * np.outer(d[batch] - 1, leverage)
-        cycles += (f[batch] * shift)[:, None]
         part = domain.spectrum[rows[batch]]
-        part *= unit_phasor(cycles)
-        part *= weights[batch, None]
+        domain.operations.turn(part, steep[batch], leverage, constant[batch], weights[batch])
         data[rows[batch]] = part
 
     over(batches(len(rows), max(32, _SAMPLES // data.shape[1])), compress)

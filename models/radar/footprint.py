@@ -125,6 +125,8 @@ class TerrainGrid:
             range(int(np.floor(a.min())) - 1, int(np.ceil(a.max())) + 2) for a in (self._i, self._j)
         )
         self._texture = scene.texture(*self.cells)
+        inside = [a - own.start for a, own in zip((self._i, self._j), self.cells, strict=True)]
+        self._coarse = [a.astype(np.float32) for a in (*inside, self.power_db, self.height)]
 
     @property
     def ties(self) -> tuple[FloatArray, FloatArray]:
@@ -137,24 +139,20 @@ class TerrainGrid:
 
         Without bright points and speckle.
         """
-        i, j, db, height = (
-            self._interpolated(a, start, stop)
-            for a in (
-                self._i - self.cells[0].start,
-                self._j - self.cells[1].start,
-                self.power_db,
-                self.height,
-            )
-        )
+        i, j, db, height = (self._interpolated(a, start, stop) for a in self._coarse)
         db += cv2.remap(self._texture, j, i, cv2.INTER_LINEAR)
         db *= np.float32(np.log(10) / 20)
         return np.exp(db, out=db), height
 
-    def _interpolated(self, coarse: FloatArray, start: int, stop: int) -> Single:
+    def _interpolated(self, coarse: Single, start: int, stop: int) -> Single:
         """Linear interpolation of coarse values to all cells of some lines."""
-        lines, cells = np.arange(start, stop), np.arange(self.footprint.n_cells)
-        rows = _between(coarse.astype(np.float32), lines / _COARSE[0])
-        return np.ascontiguousarray(_between(rows.T, cells / _COARSE[1]).T)
+        by_line, by_cell = (1 / step for step in _COARSE)
+        places = np.array([[by_cell, 0.0, 0.0], [0.0, by_line, start * by_line]])
+        # places are multiples of a 16th, which OpenCV's fixed point holds exactly
+        size = (self.footprint.n_cells, stop - start)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        fine = cv2.warpAffine(coarse, places, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(fine)
 
     def _power_db(self, scene: Scene, t: FloatArray) -> FloatArray:
         p = self.footprint.ground.point(self.latitude, self.longitude, self.height)
@@ -233,10 +231,3 @@ def _chebyshev3(values: FloatArray) -> FloatArray:
         inverse = np.linalg.inv(chebyshev.chebvander(chebyshev.chebpts1(n), n - 1))
         values = np.moveaxis(np.tensordot(inverse, values, (1, axis)), 0, axis)
     return values
-
-
-def _between(values: Single, place: FloatArray) -> Single:
-    """Linear interpolation along the first axis."""
-    k = np.minimum(place.astype(np.intp), len(values) - 2)
-    w = (place - k).astype(np.float32)[:, None]
-    return np.asarray(values[k] + w * (values[k + 1] - values[k]))

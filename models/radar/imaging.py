@@ -16,6 +16,7 @@ from terrafix.models.radar.autofocus import Focus, SharpnessCurve, autofocus
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.doppler import fractional_centroid
 from terrafix.models.radar.focusing import Image, RangeDoppler, azimuth_compressed, range_doppler
+from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
 _SLOPE_STEP = 5e-6
 """Grid of the growth of velocity with range [m/s per m]: 0.02 m/s over half a swath."""
@@ -61,6 +62,8 @@ class Imager:
         the whole band.
     exposure : float
         Share of a pulse that must have been received for a column to be used.
+    operations : Rows
+        Who turns and resamples rows of spectra.
 
     Raises
     ------
@@ -79,6 +82,7 @@ class Imager:
         migration_step: float = 50.0,
         band: tuple[float, float] = (0.0, 1.0),
         exposure: float = 1.0,
+        operations: Rows = ARRAY_ROWS,
     ) -> None:
         if not (step > 0 and migration_step > 0):
             raise ValueError(f"steps of {step} and {migration_step} m/s must be positive")
@@ -87,7 +91,7 @@ class Imager:
         self.echo, self.radar = echo, radar
         self.near_range, self.first_time = near_range, first_time
         self.step, self.migration_step, self.band = step, migration_step, band
-        self.exposure = exposure
+        self.exposure, self.operations = exposure, operations
         self.fraction, self.coherence = fractional_centroid(echo, radar.prf)
         self._curves: dict[Processing, SharpnessCurve] = {}
         self._focused: dict[tuple[Processing, int], Focus] = {}
@@ -113,6 +117,7 @@ class Imager:
                 velocity_slope=processing.velocity_slope,
                 first_time=self.first_time,
                 exposure=self.exposure,
+                operations=self.operations,
             )
             self._curves[processing] = SharpnessCurve(domain.cropped(), self.step)
         return self._curves[processing]

@@ -52,7 +52,7 @@ def pulse_echo(
     aperture : Aperture
         True places of the antenna.
     sums : PulseSums
-        `terrafix.components.sensors.pulses.pulse_sums` gives the compiled ones.
+        `terrafix.components.sensors.compiled.pulse_sums` gives the compiled ones.
     rng : numpy.random.Generator
         Of noise.
     snr_db : float, optional

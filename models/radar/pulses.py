@@ -15,7 +15,7 @@ Impulses lie between cells, so each is shared by the two cells about it, in prop
 distance from them.
 
 The sums are what costs: some 1e9 terms for the echo of a second. They are compiled from
-``pulses.c`` by whoever can (`terrafix.components.sensors.pulses`) and handed to the models, which
+``pulses.c`` by whoever can (`terrafix.components.sensors.compiled`) and handed to the models, which
 know no compiler; `ArraySums` computes the same with arrays, ten times slower.
 """
 

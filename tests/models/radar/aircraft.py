@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from terrafix.components.sensors.pulses import pulse_sums
+from terrafix.components.sensors.compiled import pulse_sums
 from terrafix.models.geometry.geodesy import chart_scales
 from terrafix.models.geometry.ground import FlatGround
 from terrafix.models.images.reference import earlier_pass

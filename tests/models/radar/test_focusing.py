@@ -83,6 +83,55 @@ def test_migration_may_be_removed_with_a_wrong_velocity(palsar, points):
     assert peak.row == pytest.approx(wrong.expected(image)[0], abs=0.1)
 
 
+def phase_at(image, row, column):
+    """Phase [cycles] of a point of an image, and its height.
+
+    The band of a squinted image lies about its Doppler centroid along the lines, and along the
+    cells about what the carrier is there of the reference, 2 (D - 1) / wavelength per meter.
+    """
+    half = 16
+    i, j = round(row), round(column)
+    chip = image.data[i - half : i + half, j - half : j + half].astype(complex)
+    y, x = np.arange(i - half, i + half) - row, np.arange(j - half, j + half) - column
+    sine = image.radar.wavelength * image.centroid / (2 * image.velocity)
+    along = image.centroid / image.radar.prf
+    across = 2 / image.radar.wavelength * (np.sqrt(1 - sine**2) - 1) * np.diff(image.slant_range)[0]
+    weights = [
+        np.sinc(a) * np.i0(4 * np.sqrt(1 - (a / (half + 1)) ** 2)) / np.i0(4) for a in (y, x)
+    ]
+    turned = chip * np.exp(-2j * np.pi * (along * y[:, None] + across * x))
+    value = weights[0] @ turned @ weights[1]
+    return np.angle(value) / (2 * np.pi), abs(value)
+
+
+@pytest.mark.parametrize(("squint", "beyond"), [(0, 1500.0), (2, -800.0), (5, -800.0), (5, 1500.0)])
+def test_squint_keeps_place_width_and_phase(points, squint, beyond):
+    """Off the middle of the swath, too: 0.03 pixel, 2 %, and the phase of the closest range.
+
+    That is -2 R / wavelength cycles; one eighth less is the spectrum of the azimuth chirp.
+    """
+    radar, velocity, middle, shape = points.RADARSAT, 7062.0, 993000.0, (1536, 3400)
+    sine = np.sin(np.radians(squint))
+    centroid, lag = 2 * velocity * sine / radar.wavelength, -middle * np.tan(np.radians(squint))
+    closest, passed = middle + beyond, shape[0] / 2 / radar.prf
+    passed -= lag / velocity * closest / middle
+    near = np.hypot(middle, lag) - 1020 * radar.range_spacing
+    echo = points.point_echo(radar, near, velocity, centroid, shape, [(closest, passed)])
+    domain = range_doppler(echo, radar, near_range=near, centroid=centroid, velocity=velocity)
+    image = azimuth_compressed(domain, velocity)
+    peak = points.Peak(image.data, half=16)
+    row = (passed - image.t[0]) * radar.prf
+    column = (closest - image.slant_range[0]) / np.diff(image.slant_range[:2])[0]
+    assert peak.row == pytest.approx(row, abs=0.03)
+    assert peak.column == pytest.approx(column, abs=0.03)
+    ideal = 0.886 * np.array([radar.prf / radar.doppler_bandwidth, radar.sample_rate / 30.116e6])
+    assert [peak.width_azimuth, peak.width_range] == pytest.approx(ideal, rel=0.02)
+    phase, height = phase_at(image, row, column)
+    off = phase + 2 * closest / radar.wavelength + 0.125
+    assert off - round(off) == pytest.approx(0.0, abs=5 / 360)
+    assert height == pytest.approx(peak.height, rel=0.03)
+
+
 def test_looks_are_disjoint_and_on_one_grid(squinted, points):
     whole = squinted.image()
     looks = azimuth_looks(squinted.domain, squinted.velocity, 2)

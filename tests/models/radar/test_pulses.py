@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from terrafix.components.sensors import pulses as compiled
+from terrafix.components.sensors import compiled
 from terrafix.models.radar.pulses import ArraySums, CompiledSums, Impulses, Profiles, Pulses
 
 WAVELENGTH, SPACING, NULL, CUT = 0.0312, 0.15, 0.0985, 0.66
