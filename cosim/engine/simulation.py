@@ -262,6 +262,7 @@ class Simulation:
             "members": [int(m) for m in self.members],
             "excluded": self.master.excluded if excluded is None else excluded,
             "base_step_s": text_seconds(self.plan.base),
+            **({} if self.plan.epoch is None else {"epoch": self.plan.epoch}),
             "order": self.plan.order,
             "kernel": self.kernel,
             "versions": versions(),

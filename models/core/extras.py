@@ -27,6 +27,6 @@ def optional(module: str, purpose: str, extra: str = "truth") -> Any:
         return import_module(module)
     except ImportError as error:
         raise ImportError(
-            f"{purpose} needs the package '{module}', which is not installed\n"
+            f"{purpose} needs the package '{module.partition('.')[0]}', which is not installed\n"
             f"  install it: pip install 'terrafix[{extra}]'"
         ) from error

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ _FIRST_DAY = datetime(1858, 11, 17, tzinfo=UTC)
 _ARC_SECOND = np.pi / (180 * 3600)
 
 
-def date_of(day: int) -> str:
+def date_of(day: int | np.integer[Any]) -> str:
     """Calendar date of a modified Julian day, "2022-09-18"."""
     return str(np.datetime64("1858-11-17") + np.timedelta64(int(day), "D"))
 
@@ -63,7 +64,7 @@ class LeapSeconds:
         if early.any():
             raise ValueError(
                 f"UTC of {date_of(day[early].flat[0])} is not known: leap seconds begin on "
-                f"{date_of(int(self.day[0]))}"
+                f"{date_of(self.day[0])}"
             )
         if late.any():
             raise ValueError(

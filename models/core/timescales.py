@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -203,11 +204,8 @@ def table_place(instant: Instant) -> tuple[IntArray, FloatArray]:
     ValueError
         If an instant lies outside the table; the message says how far it reaches.
     """
-    table = orientation_table()
+    table, nodes = orientation_table(), _midnights()
     day, seconds = _arrays(instant.day, instant.seconds)
-    # of 0 h UTC: a day with a leap second is longer
-    offset = leap_seconds().at(table.day)
-    nodes = (table.day - table.day[0]) * DAY + offset
     since = (day - table.day[0]) * DAY + seconds
     outside = ~((since >= nodes[0]) & (since < nodes[-1]))
     if outside.any():
@@ -218,6 +216,13 @@ def table_place(instant: Instant) -> tuple[IntArray, FloatArray]:
         )
     k = np.searchsorted(nodes, since, side="right") - 1
     return k, (since - nodes[k]) / (nodes[k + 1] - nodes[k])
+
+
+@cache
+def _midnights() -> FloatArray:
+    """0 h UTC of the days of the table [s], TAI since its first day; a few are 86 401 s apart."""
+    table = orientation_table()
+    return np.asarray((table.day - table.day[0]) * DAY + leap_seconds().at(table.day))
 
 
 def table_days(k: IntArray) -> FloatArray:
