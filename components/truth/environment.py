@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from terrafix.components.dated import read_epoch
 from terrafix.components.fields import ENVIRONMENT
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component, Environment
-from terrafix.cosim.declare.ports import BundleOutput
+from terrafix.cosim.declare.ports import BundleOutput, Capabilities
 from terrafix.models.core.timescales import Instant
 from terrafix.models.motion.bodies import environment_at
 
@@ -21,6 +23,7 @@ class SpaceEnvironment(Component):
     axes err by 7e-14 rad, Sun and Moon by 0.30 and 0.15 m; over 60 s by 8e-13 rad, 11 and 5 m.
     """
 
+    capabilities: ClassVar[Capabilities] = Capabilities(given=True)
     default_rate = Rate("10")
 
     _start: Instant | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.parameters import Choice, Parameter, Text
-from terrafix.cosim.declare.ports import MessageOutput, Output
+from terrafix.cosim.declare.ports import Capabilities, MessageOutput, Output
 from terrafix.models.core.batch import over_members
 from terrafix.models.core.timescales import DAY, Instant
 from terrafix.models.geometry.celestial import (
@@ -54,6 +54,7 @@ class OrbitStart(Component):
     epoch in the uniformly turning frame of type `orbit`.
     """
 
+    capabilities: ClassVar[Capabilities] = Capabilities(given=True)
     default_rate = Rate(times=["0"])
 
     kind = Choice(tuple(_TAKEN), "cartesian", doc="what is known")
