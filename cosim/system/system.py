@@ -458,12 +458,25 @@ class System(Shown):
         return system_shown(self)
 
     def flatten(self) -> FlatSystem:
-        """Resolve nesting: every component by path, every connection between their ports."""
+        """Resolve nesting: every component by path, every connection between their ports.
+
+        Raises
+        ------
+        ConfigurationError
+            If a system within has another epoch.
+        """
         flat = FlatSystem(self.name, {}, [])
         for name, node in self.nodes.items():
             if isinstance(node, Component):
                 flat.components[name] = node
                 continue
+            if node.epoch not in (None, self.epoch):
+                own = f"'{self.epoch}'" if self.epoch else "none"
+                raise ConfigurationError(
+                    f"system '{name}' has the epoch '{node.epoch}', and '{self.name}', that it is "
+                    f"part of, has {own}\n"
+                    "  there is one time for all: give both the same, or the inner one none"
+                )
             inner = node.flatten()
             flat.components |= {f"{name}.{path}": c for path, c in inner.components.items()}
             flat.connections += [

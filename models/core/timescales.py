@@ -211,7 +211,8 @@ def table_place(instant: Instant) -> tuple[IntArray, FloatArray]:
     if outside.any():
         raise ValueError(
             f"the Earth's orientation on {date_of(day[outside].flat[0])} is not known: the table "
-            f"of the IERS reaches from {date_of(table.day[0])} to {date_of(table.day[-1])}\n"
+            f"of the IERS reaches from {date_of(table.day[0])} to the start of "
+            f"{date_of(table.day[-1])}\n"
             f"  {UPDATE}"
         )
     k = np.searchsorted(nodes, since, side="right") - 1

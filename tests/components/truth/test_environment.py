@@ -64,8 +64,8 @@ def test_without_an_epoch_it_says_how_to_give_one():
 @pytest.mark.parametrize(
     ("epoch", "said"),
     [
-        ("2099-01-01T00:00:00 TAI", "reaches from 1973-01-02 to 20"),
-        ("1972-06-01T00:00:00 UTC", "reaches from 1973-01-02 to 20"),
+        ("2099-01-01T00:00:00 TAI", "reaches from 1973-01-02 to the start of 20"),
+        ("1972-06-01T00:00:00 UTC", "reaches from 1973-01-02 to the start of 20"),
         ("2022-09-18T07:49:21.5", "has no time scale"),
         ("2015-12-31T23:59:60 UTC", "does not exist: there was no leap second"),
     ],
@@ -80,7 +80,9 @@ def test_a_run_that_leaves_the_tables_is_refused_before_it_starts():
     last = date_of(orientation_table().day[-1] - 1)
     epoch = f"{last}T23:00:00 UTC"
     surrounded(epoch, duration=3000).check()
-    with pytest.raises(SystemCheckError, match=f"reaches from 1973-01-02 to {last[:7]}"):
+    with pytest.raises(
+        SystemCheckError, match=f"reaches from 1973-01-02 to the start of {last[:7]}"
+    ):
         surrounded(epoch, duration=4000).check()
 
 

@@ -163,7 +163,11 @@ OLD = {"kind": "tle", "tle": VANGUARD}
             {"kind": "keplerian", "frame": "itrf", "semi_major_axis": 7e6},
             "'itrf', which turns with the Earth",
         ),
-        ("2099-01-01T00:00:00 TAI", STATE | {"frame": "gcrf"}, "reaches from 1973-01-02 to 20"),
+        (
+            "2099-01-01T00:00:00 TAI",
+            STATE | {"frame": "gcrf"},
+            "reaches from 1973-01-02 to the start of 20",
+        ),
         ("noon", STATE | {"frame": "gcrf"}, "'noon' is no epoch"),
         (EPOCH, {"kind": "tle", "tle": VANGUARD[:69]}, "have two lines, and a name before them"),
         (EPOCH, {"kind": "tle", "tle": VANGUARD.replace("4753", "4754")}, "checksum is 4, that of"),

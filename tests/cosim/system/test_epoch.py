@@ -59,6 +59,21 @@ def test_one_that_nobody_asks_for_is_refused(toys):
         system.check()
 
 
+@pytest.mark.parametrize(("outer", "fine"), [(NOON, True), (None, False), ("midnight", False)])
+def test_a_system_within_has_no_other(toys, dated, outer, fine):
+    inner = System("inner", epoch=NOON)
+    inner.add(dated(), "c")
+    system = System("outer", epoch=outer)
+    system.add(inner, "inner")
+    if fine:
+        assert system.check().epoch == NOON
+    else:
+        with pytest.raises(
+            SystemCheckError, match="'inner' has the epoch 'noon by the tower', and"
+        ):
+            system.check()
+
+
 @pytest.mark.parametrize("epoch", ["", " ", 5, datetime.datetime(2022, 9, 18)])
 def test_what_is_no_text_is_refused(epoch):
     with pytest.raises(ConfigurationError, match="it takes text with date, time and time scale"):

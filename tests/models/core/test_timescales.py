@@ -107,8 +107,8 @@ def test_a_time_of_day_keeps_its_picoseconds():
         ("18 September 2022", "write date, time and time scale"),
         ("1971-12-31T00:00:00 UTC", "leap seconds begin on 1972-01-01"),
         ("2099-01-01T00:00:00 UTC", "leap seconds are announced until 20"),
-        ("2099-01-01T00:00:00 UT1", "reaches from 1973-01-02 to 20"),
-        ("1973-01-01T00:00:00 UT1", "reaches from 1973-01-02 to 20"),
+        ("2099-01-01T00:00:00 UT1", "reaches from 1973-01-02 to the start of 20"),
+        ("1973-01-01T00:00:00 UT1", "reaches from 1973-01-02 to the start of 20"),
     ],
 )
 def test_what_is_refused(text, said):
