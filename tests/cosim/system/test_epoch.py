@@ -12,6 +12,7 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.files.writing import system_text
+from terrafix.cosim.records.results import versions
 from terrafix.cosim.system.system import System
 
 NOON = "noon by the tower"
@@ -43,6 +44,13 @@ def test_it_reaches_the_components_and_the_result(toys, dated):
     assert f"epoch {NOON}" in repr(system)
     assert system.check().content()["epoch"] == NOON
     assert f"epoch {NOON}" in " ".join(repr(system.check()).split())
+
+
+def test_with_a_date_the_versions_of_its_tables_are_kept():
+    """They change with every package of tables; without a date nothing depends on them."""
+    tables = {"pyerfa", "astropy-iers-data", "pymsis", "sgp4"}
+    assert versions(NOON).keys() - versions().keys() == tables
+    assert not versions().keys() & tables
 
 
 def test_a_component_may_refuse_it(toys, dated):
