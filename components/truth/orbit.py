@@ -23,7 +23,9 @@ _NEAR = 1.001
 class OrbitTruth(SymbolicComponent):
     """Satellite under gravity and drag, integrated by fourth-order Runge-Kutta steps.
 
-    A member that comes to the surface of the Earth fails.
+    Its inertial frame is one from which the Earth turns uniformly about its z axis, of no date, and
+    whose x axis is `earth_angle0` west of the Earth-fixed one at t = 0; a system with an epoch has
+    none such. A member that comes to the surface of the Earth fails.
     """
 
     default_rate = Rate(hz=100)
@@ -60,6 +62,16 @@ class OrbitTruth(SymbolicComponent):
                 f"center, of a radius of {radius:.6g} m\n"
                 "  a bare number is in meters; write a unit with it: "
                 f'{self.name}.r0_i = "[7070, 0, 0] km"'
+            )
+
+    def validate_epoch(self, epoch: str | None) -> None:
+        """Refuse a date: the frame of r0_i and v0_i has none."""
+        if epoch is not None:
+            raise ConfigurationError(
+                f"'{self.name}.r0_i' and 'v0_i' are of no frame that has a date, in a system with "
+                f"the epoch '{epoch}': taken for GCRF or TEME they lie up to 36 km off\n"
+                "  take a component of type satellite and one of type orbit_start, which is told "
+                "the frame; or leave the epoch out"
             )
 
     def fail(self, mask: ArrayLike, reason: str) -> None:

@@ -218,7 +218,7 @@ def _identity(result: CampaignResult, *, histories: bool) -> dict[str, Any]:
                 "duration": f"{text_seconds(result.duration)} s",
                 "histories": histories,
                 "configuration": result.configuration,
-                "versions": versions(),
+                "versions": versions(result.configuration.get("epoch")),
             }
             | ({"statistics": added} if added else {}),
             default=str,

@@ -63,7 +63,7 @@ def summary_of(result: CampaignResult) -> dict[str, Any]:
         "setup_s": result.setup_s,
         "wall_s": result.wall_s,
         "cpu": cpu_name(),
-        "versions": versions(),
+        "versions": versions(result.configuration.get("epoch")),
         "evaluation": next(iter(each.values())) if len(each) == 1 else each,
     }
 
@@ -117,7 +117,7 @@ def _attributes(result: CampaignResult) -> dict[str, Any]:
         "configuration": result.configuration,
         "graph": result.graph,
         "source": result.source,
-        "versions": versions(),
+        "versions": versions(result.configuration.get("epoch")),
         "paths": list(result.statistics),
     }
     return {

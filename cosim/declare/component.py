@@ -141,6 +141,8 @@ class Environment:
         Every draw of noise is zero: the nominal run, about which errors are linearized.
     end : callable, optional
         ``end(mask, reason)`` ends the runs of members when this tick is over, which is no failure.
+    epoch : str, optional
+        What time it is at t = 0, as the system has it: text whose meaning components know.
     """
 
     path: str
@@ -150,6 +152,7 @@ class Environment:
     fail: Callable[[Mask, str], None]
     quiet: bool = False
     end: Callable[[Mask, str], None] | None = None
+    epoch: str | None = None
 
     @property
     def n_members(self) -> int:
@@ -367,6 +370,14 @@ class Component(Shown):
 
     def validate_duration(self, duration: float) -> None:
         """Raise ConfigurationError if it cannot serve a run of `duration` [s] (a recording)."""
+
+    def validate_epoch(self, epoch: str | None) -> None:
+        """Raise ConfigurationError if it cannot serve a system of an `epoch`, or of none."""
+
+    @classmethod
+    def asks_for_epoch(cls) -> bool:
+        """Whether an epoch makes a difference to it: whether a class provides `validate_epoch`."""
+        return cls.validate_epoch is not Component.validate_epoch
 
     def bind(self, environment: Environment) -> None:
         """Get arrays for states and parameters; called once, before ports are bound."""

@@ -392,9 +392,13 @@ class Capabilities:
         It offers a symbolic model: kernels, Jacobians, export.
     deterministic : bool
         The same inputs and seed give the same bytes.
+    given : bool
+        It reads nothing and draws no noise: what it publishes follows from the time and its
+        parameters, so that nothing of it deviates between members.
     """
 
     state: bool = True
     symbolic: bool = False
     deterministic: bool = True
+    given: bool = False
     notes: tuple[str, ...] = dataclass_field(default=())

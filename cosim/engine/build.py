@@ -83,7 +83,7 @@ def bind_components(
         def finish(mask: NDArray[np.bool_], reason: str, path: str = path) -> None:
             (end or fail)(path, mask, reason)
 
-        component.bind(Environment(path, seed, members, active, report, quiet, finish))
+        component.bind(Environment(path, seed, members, active, report, quiet, finish, plan.epoch))
 
 
 def connect_ports(plan: Plan, n_members: int, active: NDArray[np.bool_]) -> Wiring:

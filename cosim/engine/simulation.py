@@ -211,7 +211,7 @@ class Simulation:
             "master": self.master.get_state(),
             "recorders": {r.name: r.get_state() for r in self.recorders},
             "identity": self._identity(),
-            "versions": versions(),
+            "versions": versions(self.plan.epoch),
         }
 
     def set_state(self, saved: dict[str, Any]) -> None:
@@ -262,9 +262,10 @@ class Simulation:
             "members": [int(m) for m in self.members],
             "excluded": self.master.excluded if excluded is None else excluded,
             "base_step_s": text_seconds(self.plan.base),
+            **({} if self.plan.epoch is None else {"epoch": self.plan.epoch}),
             "order": self.plan.order,
             "kernel": self.kernel,
-            "versions": versions(),
+            "versions": versions(self.plan.epoch),
             "cpu": cpu_name(),
             "configuration": self.configuration,
         }

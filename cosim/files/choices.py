@@ -11,7 +11,7 @@ from terrafix.cosim.declare.parameters import PATHS, shown
 from terrafix.cosim.files.loading import Load
 from terrafix.cosim.system.system import System
 
-TOP = ("schema", "name", "doc", "duration", "members", "seed")
+TOP = ("schema", "name", "doc", "duration", "members", "seed", "epoch")
 TABLES = ("component", "wiring", "expose", "record", "dispersion", "choice")
 TIMING = ("rate", "period", "offset", "times")
 Settings = Sequence[tuple[str, str]]

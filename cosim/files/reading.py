@@ -60,7 +60,7 @@ from terrafix.cosim.files.choices import (
 from terrafix.cosim.files.loading import Load
 from terrafix.cosim.system.check import check
 from terrafix.cosim.system.dispersion import KINDS, Dispersion
-from terrafix.cosim.system.system import System
+from terrafix.cosim.system.system import System, checked_epoch
 
 SCHEMA = "terrafix-system/1"
 _CONNECTION = re.compile(r"\s*([\w.]+)\s*->\s*([\w.]+)\s*(?:\(\s*delay\s+([^)]+?)\s*\))?\s*\Z")
@@ -177,6 +177,8 @@ def _make(load: Load, top: Mapping[str, Any], path: Path) -> System:
     if "duration" in top:
         made = load.attempt(System, "x", duration=top["duration"])
         system.duration = made.duration if made is not None else None
+    if "epoch" in top:
+        system.epoch = load.attempt(checked_epoch, top["epoch"])
     for key, least in (("members", 1), ("seed", 0)):
         if key in top:
             value = load.attempt(Count(minimum=least).read, top[key], where=f"'{key}'")

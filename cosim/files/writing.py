@@ -85,6 +85,7 @@ def _content(system: System) -> dict[str, Any]:
     content |= _doc(system.doc)
     if system.duration is not None:
         content["duration"] = f"{text_seconds(system.duration)} s"
+    content |= {} if system.epoch is None else {"epoch": system.epoch}
     content |= {"members": system.members, "seed": system.seed}
     names = _names(flat.components)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.evaluation import Evaluation
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.lincov.jacobians import Key, Linear
@@ -47,7 +48,7 @@ class Wires:
         for path, component in self._components.items():
             if isinstance(component, SymbolicComponent) and component.capabilities.symbolic:
                 self.symbolic[path] = component
-            elif component is not self.evaluation:
+            elif component is not self.evaluation and not _given(component):
                 raise ConfigurationError(
                     f"'{path}' ({type(component).__name__}) has no symbolic Jacobian, so the "
                     "system cannot be linearized\n  fly a campaign instead"
@@ -60,6 +61,8 @@ class Wires:
         if connection is None:
             return None
         owner, _, port_name = connection.source.rpartition(".")
+        if owner not in self.symbolic:
+            return None
         port = self._components[path].ports[head]
         if connection.delay or port.window or port.queue > 1:
             what = "a delay" if connection.delay else "a window or queue"
@@ -102,6 +105,11 @@ class Wires:
                     _, owner, full = self.slot_of(path, name)
                     found.setdefault(owner, set()).add(full)
         return found
+
+
+def _given(component: Component) -> bool:
+    """Whether what it publishes is the same whatever deviates."""
+    return component.capabilities.given and not component.inputs()
 
 
 def _part(port: Any, tail: str, factor: FloatArray) -> FloatArray | None:

@@ -39,17 +39,21 @@ def time_axes(times: Mapping[str, NDArray[np.float64]]) -> dict[str, str]:
     return {record: f"time_{first[values.tobytes()]}" for record, values in times.items()}
 
 
-def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+def versions(epoch: str | None = None) -> dict[str, str]:
+    """Versions of what the numbers depend on: with an epoch, on tables of what happened then."""
     from importlib.metadata import PackageNotFoundError, version
 
     found = {"python": platform.python_version()}
-    for package in ("terrafix", "numpy", "casadi", "scipy", "fmpy"):
+    for package in (*_PACKAGES, *(_DATED if epoch is not None else ())):
         try:
             found[package] = version(package)
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
+
+
+_PACKAGES = ("terrafix", "numpy", "casadi", "scipy", "fmpy")
+_DATED = ("pyerfa", "astropy-iers-data", "pymsis", "sgp4")
 
 
 class _Labels:

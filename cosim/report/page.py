@@ -52,10 +52,12 @@ def _facts(campaign: Campaign) -> list[tuple[str, Any]]:
     a = campaign.dataset.attrs
     runs, failed = int(a["runs"]), int(a["n_excluded"])
     versions = campaign.attribute("versions")
+    epoch = campaign.attribute("configuration").get("epoch")
     return [
         ("runs", f"{runs:,}" + (f", {failed:,} of which failed" if failed else "")),
         ("root seed", a["seed"]),
         ("duration", a["duration"]),
+        *([] if epoch is None else [("epoch", epoch)]),
         ("time", f"{a['wall_s']:.2f} s, set up in {a['setup_s']:.2f} s"),
         ("flown by", a["workers"]),
         ("kernels", a["kernel"]),

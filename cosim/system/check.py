@@ -47,6 +47,8 @@ class Plan(Shown):
         What is allowed but worth knowing.
     start : Start
         How components are initialized.
+    epoch : str or None
+        What time it is at t = 0.
     """
 
     flat: FlatSystem
@@ -55,12 +57,13 @@ class Plan(Shown):
     grid: Fraction
     notes: list[str]
     start: Start
+    epoch: str | None = None
 
     def content(self) -> dict[str, Any]:
         """Plain types for JSON, components in stepping order."""
         from terrafix.cosim.system.display import plan_content
 
-        return plan_content(self.flat, self.order, self.base, self.notes)
+        return plan_content(self.flat, self.order, self.base, self.notes, self.epoch)
 
     def _shown(self) -> list[Block]:
         from terrafix.cosim.system.display import plan_shown
@@ -106,7 +109,8 @@ def check(system: Flattened, *, duration: Fraction | None = None, outside: bool 
             )
         )
     for path, component in flat.components.items():
-        problems.extend(_component_problems(path, component, duration))
+        problems.extend(_component_problems(path, component, duration, system.epoch))
+    problems.extend(_idle_epoch(flat, system.epoch))
     exposed = {system.resolve(p)[0] for p in system.exposed.values()} if outside else set()
     problems.extend(_unconnected(flat, exposed))
     problems.extend(_two_drivers(flat))
@@ -128,11 +132,11 @@ def check(system: Flattened, *, duration: Fraction | None = None, outside: bool 
         raise SystemCheckError(system.name, problems)
     start = starting_order(flat, order)
     notes = [*system.notes, *_notes(flat), *_starting_notes(start)]
-    return Plan(flat, order, base, grid, notes, start)
+    return Plan(flat, order, base, grid, notes, start, system.epoch)
 
 
 def _component_problems(
-    path: str, component: Component, duration: Fraction | None
+    path: str, component: Component, duration: Fraction | None, epoch: str | None
 ) -> Iterator[TerrafixError]:
     missing = component.missing_settings()
     given, kept = component.given_parameters, component.parameter_values
@@ -150,6 +154,7 @@ def _component_problems(
     actions: list[Callable[[], None]] = []
     if not missing and not refused:
         actions.append(component.validate)
+        actions.append(lambda: component.validate_epoch(epoch))
         if duration is not None:
             actions.append(lambda: component.validate_duration(float(duration)))
     for port in component.ports.values():
@@ -159,6 +164,16 @@ def _component_problems(
             action()
         except TerrafixError as error:
             yield error
+
+
+def _idle_epoch(flat: FlatSystem, epoch: str | None) -> Iterator[TerrafixError]:
+    if epoch is None or not flat.components:
+        return
+    if not any(component.asks_for_epoch() for component in flat.components.values()):
+        yield ConfigurationError(
+            f"the epoch '{epoch}' does nothing: no component asks what time it is\n"
+            "  leave it out, or add a component that does"
+        )
 
 
 def _check_units(field: Field) -> None:

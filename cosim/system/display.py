@@ -29,6 +29,7 @@ class Whole(Flattened, Protocol):
     duration: Fraction | None
     members: int
     seed: int
+    epoch: str | None
     connections: list[Connection]
     records: list[Record]
     dispersions: list[Dispersion]
@@ -48,6 +49,7 @@ def system_shown(system: Whole) -> list[Block]:
     header.append(f": {', '.join(parts)}", style="not bold")
     flight = [] if system.duration is None else [f"{text_seconds(system.duration)} s"]
     flight += [_count(system.members, "member"), f"seed {system.seed}"]
+    flight += [] if system.epoch is None else [f"epoch {system.epoch}"]
     shown: list[Block] = [header, Text(", ".join(flight))]
     doc = system.doc.strip().partition("\n")[0]
     shown += [Text(doc)] if doc else []
@@ -154,7 +156,11 @@ def _leaf(system: Whole, path: str) -> str | None:
 
 
 def plan_content(
-    flat: FlatSystem, order: Sequence[str], base: Fraction, notes: Sequence[str]
+    flat: FlatSystem,
+    order: Sequence[str],
+    base: Fraction,
+    notes: Sequence[str],
+    epoch: str | None = None,
 ) -> dict[str, Any]:
     """Describe a checked system in plain types, its components in stepping order."""
     return {
@@ -162,6 +168,7 @@ def plan_content(
         "ok": True,
         "base_step_s": float(base),
         "base_step": f"{text_seconds(base)} s",
+        **({} if epoch is None else {"epoch": epoch}),
         "order": list(order),
         "components": {
             path: {
@@ -201,6 +208,7 @@ def plan_shown(content: Mapping[str, Any]) -> list[Block]:
         Text(
             f"{content['system']}: {len(rows)} components in stepping order, "
             f"{len(content['connections'])} connections, base step {content['base_step']}"
+            + (f", epoch {content['epoch']}" if "epoch" in content else "")
         ),
         Table(["", "component", "type", "steps"], rows),
         *(Text(f"note: {note}") for note in content["notes"]),

@@ -70,6 +70,8 @@ class Flattened(Protocol):
     """Paths of ports, by the names they are exposed under."""
     notes: list[str]
     """What whoever read it found worth knowing."""
+    epoch: str | None
+    """What time it is at t = 0, in words that components know."""
 
     def resolve(self, path: str) -> tuple[str, Port[object]]:
         """Follow exposed ports down to (path of the component's port, port)."""

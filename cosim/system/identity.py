@@ -11,9 +11,10 @@ from terrafix.cosim.system.check import Plan
 
 
 def configuration(plan: Plan) -> dict[str, Any]:
-    """Everything that was set, in plain types: components, connections, records, dispersions."""
+    """Everything that was set, in plain types: components, connections, records and the like."""
     flat = plan.flat
     return {
+        **({} if plan.epoch is None else {"epoch": plan.epoch}),
         "components": {
             path: {
                 "type": _type(type(c)),

@@ -26,6 +26,7 @@ from terrafix.cosim.basics.errors import (
     nearest,
 )
 from terrafix.cosim.declare.component import Component, PortRef
+from terrafix.cosim.declare.parameters import shown
 from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.show.tables import Block, Shown
 from terrafix.cosim.system.dispersion import Dispersion
@@ -65,6 +66,8 @@ class System(Shown):
         Size of the ensemble unless told otherwise.
     seed : int
         Root seed unless told otherwise.
+    epoch : str, optional
+        What time it is at t = 0; components know what it means.
     """
 
     def __init__(
@@ -75,12 +78,14 @@ class System(Shown):
         duration: Exact | None = None,
         members: int = 1,
         seed: int = 0,
+        epoch: str | None = None,
     ) -> None:
         self.name = _checked_name(name, "system")
         self.doc = doc
         self.duration = None if duration is None else _positive(duration, "duration")
         self.members = members
         self.seed = seed
+        self.epoch = epoch if epoch is None else checked_epoch(epoch)
         self.nodes: dict[str, Component | System] = Nodes()
         self.connections: list[Connection] = []
         self.exposed: dict[str, str] = {}
@@ -453,12 +458,25 @@ class System(Shown):
         return system_shown(self)
 
     def flatten(self) -> FlatSystem:
-        """Resolve nesting: every component by path, every connection between their ports."""
+        """Resolve nesting: every component by path, every connection between their ports.
+
+        Raises
+        ------
+        ConfigurationError
+            If a system within has another epoch.
+        """
         flat = FlatSystem(self.name, {}, [])
         for name, node in self.nodes.items():
             if isinstance(node, Component):
                 flat.components[name] = node
                 continue
+            if node.epoch not in (None, self.epoch):
+                own = f"'{self.epoch}'" if self.epoch else "none"
+                raise ConfigurationError(
+                    f"system '{name}' has the epoch '{node.epoch}', and '{self.name}', that it is "
+                    f"part of, has {own}\n"
+                    "  there is one time for all: give both the same, or the inner one none"
+                )
             inner = node.flatten()
             flat.components |= {f"{name}.{path}": c for path, c in inner.components.items()}
             flat.connections += [
@@ -493,6 +511,16 @@ def _checked_name(name: str, what: str) -> str:
             f"'{name}' cannot name a {what}: use letters, digits and underscores, a letter first"
         )
     return name
+
+
+def checked_epoch(value: object) -> str:
+    """Accept the text of an epoch, whatever it says; ConfigurationError if it is none."""
+    if not isinstance(value, str) or not value.strip():
+        raise ConfigurationError(
+            f"the epoch is {shown(value)}; it takes text with date, time and time scale\n"
+            '  write epoch = "2022-09-18T07:49:21.5 UTC"'
+        )
+    return value.strip()
 
 
 def _positive(value: Exact, what: str) -> Fraction:

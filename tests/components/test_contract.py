@@ -137,9 +137,11 @@ SETTINGS = {
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "mekf_predict_smoothed": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "orbit": {"r0_i": R_E, "v0_i": [-560.1, 3729.6, 6497.9]},
+    "orbit_start": {"frame": "gcrf", "r0": R_E, "v0": [-560.1, 3729.6, 6497.9]},
     "synthetic_sar_fix": {"look": 0.6},
 }
-RATES = dict.fromkeys(("last_known_state", "last_known_flight"), Rate(times=["0"]))
+RATES = dict.fromkeys(("last_known_state", "last_known_flight", "orbit_start"), Rate(times=["0"]))
+EPOCHS = dict.fromkeys(("environment", "orbit_start"), "2022-09-18T07:49:21.5 UTC")
 
 
 class Inputs(Component):
@@ -220,7 +222,7 @@ def build(request, recording, track):
         settings["track_file"] = track
 
     def build_system() -> System:
-        system = System("contract")
+        system = System("contract", epoch=EPOCHS.get(request.param))
         part = system.add(kind(rate=RATES.get(request.param, Rate(STEP)), **settings), name="part")
         if part.inputs():
             ports = {n: source_of(p) for n, p in part.inputs().items()}

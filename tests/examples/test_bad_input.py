@@ -472,7 +472,16 @@ SYSTEM_MISTAKES = {
         "3",
         "ConfigurationError: cannot set 'sensors': there is no 'sensors'\n"
         "  what can be set: ads, antenna, attitude, case, config, correct, dispersion, doc, "
-        "duration, evaluation, imu, last_known, members, name, orbit, predict, record, sar, seed",
+        "duration, epoch, evaluation, imu, last_known, members, name, orbit, predict, record, "
+        "sar, seed",
+    ),
+    "epoch of an orbit that has no frame": setting(
+        "epoch",
+        "2022-09-18T07:49:21 UTC",
+        "ConfigurationError: 'orbit.r0_i' and 'v0_i' are of no frame that has a date, in a system "
+        "with the epoch '2022-09-18T07:49:21 UTC': taken for GCRF or TEME they lie up to 36 km "
+        "off\n  take a component of type satellite and one of type orbit_start, which is told the "
+        "frame; or leave the epoch out",
     ),
     "setting of a component": setting(
         "orbit",

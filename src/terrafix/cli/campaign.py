@@ -10,6 +10,7 @@ import click
 from terrafix.cli.options import (
     Settings,
     duration_option,
+    epoch_option,
     json_option,
     quiet_option,
     read,
@@ -28,6 +29,7 @@ from terrafix.cosim.basics.errors import ConfigurationError
 @set_option
 @seed_option
 @duration_option
+@epoch_option
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes to fly it.")
 @click.option("--dask", metavar="ADDRESS|local:N", help="Fly it on a Dask cluster.")
 @click.option("--out", metavar="DIR", help="Folder to keep the campaign in.")
@@ -142,6 +144,7 @@ def _one_member(
 @system_argument
 @set_option
 @duration_option
+@epoch_option
 @json_option
 def lincov(system: str, settings: Settings, duration: str | None, as_json: bool) -> int:
     """Predict a campaign by linear covariance analysis: sigma, error budget, observability."""

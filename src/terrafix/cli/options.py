@@ -75,9 +75,23 @@ def set_option(command: Command) -> Command:
     )(command)
 
 
+def _epoch(context: click.Context, option: click.Parameter, text: str | None) -> None:
+    """Turn ``--epoch`` into a setting of the system's key."""
+    del option
+    if text is not None:
+        context.params["settings"] = (*context.params.get("settings", ()), ("epoch", text))
+
+
 seed_option = click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Root seed.")
 duration_option = click.option(
     "--duration", metavar="S", help='Simulated time, exact: "590.4" or "10 min".'
+)
+epoch_option = click.option(
+    "--epoch",
+    metavar="TEXT",
+    expose_value=False,
+    callback=_epoch,
+    help='What time it is at t = 0: "2022-09-18T07:49:21.5 UTC".',
 )
 quiet_option = click.option("--quiet", is_flag=True, help="Nothing but errors on standard error.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")

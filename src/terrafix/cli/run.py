@@ -11,6 +11,7 @@ import click
 from terrafix.cli.options import (
     Settings,
     duration_option,
+    epoch_option,
     json_option,
     quiet_option,
     read,
@@ -36,6 +37,7 @@ FIGURES = (".png", ".svg", ".pdf")
 @set_option
 @seed_option
 @duration_option
+@epoch_option
 @click.option("--out", metavar="FILE.nc", help="Write records to a NetCDF file.")
 @click.option("--plot", metavar="FILE.png", help="Draw the result (.png, .svg or .pdf).")
 @click.option("--checkpoint-every", metavar="S", help="Simulated seconds between checkpoints.")

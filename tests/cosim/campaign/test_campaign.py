@@ -125,7 +125,7 @@ def test_a_folder_of_another_campaign_is_refused(whole, tmp_path, monkeypatch):
     from terrafix.cosim.records import results
 
     real = results.versions()
-    monkeypatch.setattr(results, "versions", lambda: real | {"casadi": "1.0"})
+    monkeypatch.setattr(results, "versions", lambda _: real | {"casadi": "1.0"})
     with pytest.raises(CheckpointError, match=r"other versions: casadi .*, here 1\.0"):
         fly(out=folder, resume=True)
 

@@ -2,20 +2,26 @@
 
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from campaign_parts import Filter, Judge, scalar_system
 from scipy.stats import norm
 
+from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.campaign.campaign import run_campaign
+from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.ports import Capabilities, Input, Output
 from terrafix.cosim.files.readers import read_system
+from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.lincov import deviations
 from terrafix.cosim.lincov.deviations import linear_covariance
 from terrafix.cosim.lincov.prediction import LinearCovariance
 from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.cosim.system.system import System
+from terrafix.models.core.model import Model
 
 OPEN_LOOP = Path(__file__).parents[3] / "examples" / "spacecraft_sar_open_loop.toml"
 
@@ -110,6 +116,47 @@ def test_a_dispersion_of_what_has_no_jacobian_is_named():
 def test_what_cannot_be_linearized_is_named():
     with pytest.raises(ConfigurationError, match=r"'wire' \(Tripwire\) has no symbolic Jacobian"):
         linear_covariance(scalar_system(tripwire=1))
+
+
+class Given(Component):
+    """What is the same for all: twice the time."""
+
+    capabilities = Capabilities(given=True)
+    default_rate = Rate("1")
+    y = Output(unit="m")
+
+    def _initialize_impl(self):
+        self.y = 0.0
+
+    def _step_impl(self, t, dt):
+        self.y = 2 * t
+
+
+class Doubled(SymbolicComponent):
+    """Twice what it reads."""
+
+    default_rate = Rate("1")
+    u = Input(unit="m")
+    y = Output(unit="m")
+
+    def build_model(self):
+        u = ca.SX.sym("u")
+        return Model("doubled", inputs={"u": u}, outputs={"y": 2 * u})
+
+
+def test_what_is_given_is_taken_as_it_is():
+    """It is no obstacle, and adds nothing to what deviates; what reads it need not know."""
+    system, alone = scalar_system(), scalar_system()
+    given = system.add(Given(), "given")
+    system.connect(given["y"], system.add(Doubled(), "doubled")["u"])
+    np.testing.assert_array_equal(linear_covariance(system).total, linear_covariance(alone).total)
+
+
+def test_what_reads_something_is_not_given():
+    system = scalar_system(tripwire=1)
+    system.nodes["wire"].capabilities = Capabilities(given=True)
+    with pytest.raises(ConfigurationError, match=r"'wire' \(Tripwire\) has no symbolic Jacobian"):
+        linear_covariance(system)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from campaign_parts import scalar_system
+from campaign_parts import Tripwire, scalar_system
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.campaign.campaign import run_campaign
@@ -96,6 +96,23 @@ def test_a_browser_shows_the_page(page, tmp_path):
     assert title, done.stderr[-500:]
     found = json.loads(title[1].replace("&quot;", '"'))
     assert found == {"images": 3, "decoded": 3, "wide": False, "svg": 1}
+
+
+def test_a_campaign_of_a_date_says_so(tmp_path):
+    """Among its facts, and in its configuration in one line."""
+
+    class Dated(Tripwire):
+        """Asks what time it is."""
+
+        def validate_epoch(self, epoch):
+            assert epoch == "noon by the tower"
+
+    system = scalar_system()
+    system.epoch = "noon by the tower"
+    system.connect(system["filter"]["truth"], system.add(Dated(), "dated")["u"])
+    run_campaign(system, runs=4, workers=1, out=tmp_path / "c")
+    path, _ = write_report(tmp_path / "c")
+    assert path.read_text().count("noon by the tower") == 2
 
 
 @pytest.mark.parametrize("form", ["png", "svg"])
