@@ -117,9 +117,24 @@ def _live_as_a_fork(functions: Callable[[], dict[str, Any]], requests: int, answ
         for handle in handles - {0, 1, 2, requests, answers}:
             with suppress(OSError):  # that of the list itself
                 os.close(handle)
-        answer_requests(functions(), os.fdopen(requests, "rb"), os.fdopen(answers, "wb"))
+        try:
+            found = functions()
+        except TerrafixError as error:  # the binary cannot be loaded, say
+            found = _Refusing(error)
+        answer_requests(found, os.fdopen(requests, "rb"), os.fdopen(answers, "wb"))
     finally:
         os._exit(0)
+
+
+class _Refusing(dict[str, Any]):
+    """Functions none of which can be called, for one reason."""
+
+    def __init__(self, error: TerrafixError) -> None:
+        super().__init__()
+        self._error = error
+
+    def __missing__(self, name: str) -> Any:
+        raise self._error
 
 
 class FleetApart:

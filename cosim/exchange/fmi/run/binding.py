@@ -1,5 +1,7 @@
 """The C interface of FMI 2 and 3, as far as terrafix calls it, under one set of names.
 
+That of FMI 1 is in `terrafix.cosim.exchange.fmi.run.fmi1`.
+
 One `Library` for each binary, however many instances: loading it once for each instance exhausts
 the loader after a thousand. Status and messages of an instance become `FmuError`.
 """
@@ -35,6 +37,7 @@ _TYPES: dict[str, tuple[str, Any]] = {  # of the variable: (in function names, o
     "Integer": ("Integer", ct.c_int),
     "Enumeration2": ("Integer", ct.c_int),
     "Boolean2": ("Boolean", ct.c_int),
+    "Boolean1": ("Boolean", ct.c_uint8),
     "Float64": ("Float64", ct.c_double),
     "Float32": ("Float32", ct.c_float),
     "Int8": ("Int8", ct.c_int8),
@@ -129,6 +132,8 @@ class _EventInfo2(ct.Structure):
 
 
 _messages: dict[int, list[str]] = {}
+SPEAKERS: dict[Any, int] = {}
+"""Environments of instances that a message names by other means (FMI 1): pointer, or name."""
 HEARD: dict[int, list[tuple[int, str]]] = {}
 """By environment, what an instance logged, status and text, until a fleet takes it."""
 _MOST_HEARD = 100
@@ -145,7 +150,9 @@ def _note(environment: int | None, status: int, text: bytes | None) -> None:
 
 
 def _log_of_fmi2(environment: Any, name: Any, status: Any, category: Any, text: Any) -> None:
-    del name, category
+    del category
+    if SPEAKERS:
+        environment = SPEAKERS.get(environment, SPEAKERS.get(name, environment))
     _note(environment, status, text)
 
 
@@ -199,7 +206,8 @@ class Library:
         self.kind = kind
         self.version = archive.version
         self.interface = interface
-        self.prefix = f"fmi{archive.version}"
+        first = f"{interface.modelIdentifier}_fmi" if archive.version == 1 else ""
+        self.prefix = first or f"fmi{archive.version}"
         self.instantiated = False
         path = archive.binary(interface.modelIdentifier)
         here = Path.cwd()
@@ -273,6 +281,18 @@ class Instance:
         Instance._next += 1
         _messages[self._environment] = []
         self.pointer: ct.c_void_p | None = None
+        function, arguments = self._creation(name)
+        function.restype = ct.c_void_p
+        library.instantiated = True
+        with Kept():
+            made = function(*arguments)
+        if not made:
+            raise FmuError(f"the FMU could not be instantiated{self.said()}")
+        self.pointer = ct.c_void_p(made)
+
+    def _creation(self, name: str) -> tuple[Any, list[Any]]:
+        """The function that makes an instance, and its arguments."""
+        library, event_mode = self.library, self._event_mode
         token = library.archive.description.guid or ""
         resources = library.archive.folder / "resources"
         co_simulation = library.kind == CO_SIMULATION
@@ -299,13 +319,7 @@ class Instance:
                 arguments += [None, ct.c_size_t(0)]
             arguments += [ct.c_void_p(self._environment), _log3]
             arguments += [None] if co_simulation else []
-        function.restype = ct.c_void_p
-        library.instantiated = True
-        with Kept():
-            made = function(*arguments)
-        if not made:
-            raise FmuError(f"the FMU could not be instantiated{self.said()}")
-        self.pointer = ct.c_void_p(made)
+        return function, arguments
 
     def said(self) -> str:
         """What the FMU logged since it was last asked, for an error."""
@@ -379,15 +393,14 @@ class Instance:
     # ------------------------------------------------------------------ variables
 
     def _type(self, kind: str) -> tuple[str, Any]:
-        if self._version == 2 and f"{kind}2" in _TYPES:
-            kind = f"{kind}2"
-        return _TYPES[kind]
+        own = "Enumeration2" if kind == "Enumeration" else f"{kind}{self._version}"
+        return _TYPES[own if self._version < 3 and own in _TYPES else kind]
 
     def get(self, kind: str, vr: Any, n: int) -> NDArray[Any]:
         """Values of variables of one type, `n` numbers in all."""
         name, ctype = self._type(kind)
         values = (ctype * max(n, 1))()
-        sizes = () if self._version == 2 else (ct.c_size_t(n),)
+        sizes = () if self._version < 3 else (ct.c_size_t(n),)
         self.call(f"Get{name}", vr, ct.c_size_t(len(vr)), values, *sizes)
         return np.array(values[:n])
 
@@ -402,7 +415,7 @@ class Instance:
         else:
             converted = self._wholes(kind, vr, flat)
         array = (ctype * max(len(flat), 1))(*converted)
-        sizes = () if self._version == 2 else (ct.c_size_t(len(flat)),)
+        sizes = () if self._version < 3 else (ct.c_size_t(len(flat)),)
         self.call(f"Set{name}", vr, ct.c_size_t(len(vr)), array, *sizes)
 
     def _wholes(self, kind: str, vr: Any, values: list[Any]) -> list[int]:
@@ -442,7 +455,7 @@ class Instance:
     def set_texts(self, vr: Any, texts: Sequence[str]) -> None:
         """Set variables of text."""
         array = (ct.c_char_p * max(len(texts), 1))(*(text.encode() for text in texts))
-        sizes = () if self._version == 2 else (ct.c_size_t(len(texts)),)
+        sizes = () if self._version < 3 else (ct.c_size_t(len(texts)),)
         self.call("SetString", vr, ct.c_size_t(len(vr)), array, *sizes)
 
     # ------------------------------------------------------------------ co-simulation

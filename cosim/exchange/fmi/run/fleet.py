@@ -32,6 +32,7 @@ from terrafix.cosim.exchange.fmi.run.binding import (
     load_library,
     references,
 )
+from terrafix.cosim.exchange.fmi.run.fmi1 import InstanceOfFmi1
 from terrafix.cosim.exchange.fmi.run.parameters import Start
 from terrafix.cosim.exchange.fmi.run.solvers import Integrator
 from terrafix.cosim.exchange.fmi.run.whole import INTEGER, MOST, cells
@@ -298,7 +299,8 @@ class Fleet:
 
     def _enter_one(self, row: int) -> None:
         name = f"{self.setup.name}_{row}"
-        instance = Instance(self.library, name, event_mode=self.setup.event_mode)
+        made = InstanceOfFmi1 if self.library.version == 1 else Instance
+        instance = made(self.library, name, event_mode=self.setup.event_mode)
         self.instances[row] = instance
         structural = [s for s in self.setup.starts if s.structural]
         if structural:
@@ -381,6 +383,8 @@ class Fleet:
         groups = (self.setup.inputs, self.setup.outputs)
         real = all(len(g) <= 1 and all(x.kind in _DOUBLE for x in g) for g in groups)
         if not real or self.setup.kind != CO_SIMULATION or self.setup.event_mode:
+            return
+        if self.library.version == 1:
             return
         self._quick = {
             row: _Quick(instance, self)

@@ -304,6 +304,9 @@ def _quantities(
         causality = variable.causality or "local"
         if causality not in wanted:
             continue
+        if variable.name in archive.negated:
+            left_out += [variable.name] if causality in CONNECTED else []
+            continue
         text = variable.type == "String" and variable.causality in PARAMETERS
         if not text and variable.type not in (*REAL, *INTEGER, *BOOLEAN):
             if variable.causality in ("input", "output"):

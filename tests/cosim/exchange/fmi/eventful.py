@@ -20,7 +20,12 @@ HEAD = """
 def make_fmu(path, source, description, *, fmi, defines=""):
     """Write an FMU of one C file; `description` is what stands in fmiModelDescription."""
     binary = build({"model.c": HEAD + defines + source}, ["model.c"], (None,))[host_platform()]
-    names = {2: 'fmiVersion="2.0" guid="t"', 3: 'fmiVersion="3.0" instantiationToken="t"'}
+    names = {
+        1: 'fmiVersion="1.0" guid="t" modelIdentifier="m" numberOfContinuousStates="0" '
+        'numberOfEventIndicators="0"',
+        2: 'fmiVersion="2.0" guid="t"',
+        3: 'fmiVersion="3.0" instantiationToken="t"',
+    }
     xml = f'<fmiModelDescription {names[fmi]} modelName="m">{description}</fmiModelDescription>'
     host = host_platform()
     with zipfile.ZipFile(path, "w") as archive:

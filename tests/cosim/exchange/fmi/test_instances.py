@@ -176,3 +176,14 @@ def test_a_loop_of_fmus_that_can_be_instantiated_once(tmp_path):
     assert y == pytest.approx([0.9**-5] * 2, rel=1e-10)
     assert "once in a process" in result.notes[0]
     assert np.isfinite(y).all()
+
+
+def test_a_binary_that_cannot_be_loaded_says_why_in_processes_of_their_own(tmp_path):
+    """It wants a function that nobody has; the process of a member ended without a word."""
+    file = foreign(
+        tmp_path / "x.fmu",
+        globals_="extern int nobody_has_this; int *here = &nobody_has_this;",
+        flags=ONCE,
+    )
+    with pytest.raises(StepError, match=r"x.fmu' cannot be loaded: .*nobody_has_this"):
+        flown(part(file), members=2)
