@@ -480,7 +480,13 @@ class Fmu(Telling):
         self._messages = [p for p in interface.ports if p.is_input and p.kind == "message"]
         self._outputs = [p for p in interface.ports if not p.is_input]
         self._published = [p for p in self._outputs if p.kind == "message"]
-        read = [(p.name, n, q) for p in self._inputs for n, (q, _) in p.fields.items()]
+        read = [
+            (p.name, n, q)
+            for p in self._inputs
+            for n, (q, _) in p.fields.items()
+            # what nobody gives a value keeps that of the FMU
+            if p.name not in self.undriven or q.start is not None or q.name in self._given
+        ]
         written = [(p.name, n, q) for p in self._outputs for n, (q, _) in p.fields.items()]
         written += [(p.name, "t", p.t) for p in self._outputs if p.t]
         written += [(p.name, "sequence", p.sequence) for p in self._outputs if p.sequence]

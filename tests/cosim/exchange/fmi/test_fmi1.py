@@ -33,7 +33,7 @@ F void *m_fmiInstantiateSlave(const char *name, const char *guid, const char *wh
     struct m *i = f.allocate(1, sizeof *i);
     if (strcmp(guid, "t") || strcmp(mime, "application/x-fmu-sharedlibrary")) return NULL;
     strncpy(i->name, name, 63);
-    i->f = f, i->k = 2.0, i->n = 1;
+    i->f = f, i->u = 7.0, i->k = 2.0, i->n = 1;
     return i;
 }
 F void m_fmiFreeSlaveInstance(void *c) { of(c)->f.release(c); }
@@ -181,6 +181,19 @@ def test_an_initial_output_is_set_before_it_is_initialized(first, tmp_path):
     found = simulate(system, duration="0.3").dataset
     assert found["b.count"].values.ravel().tolist() == [0, 0, 1, 3]
     assert found["b.x"].values.ravel() == pytest.approx([4.0, 4.8, 5.76, 6.88])
+
+
+def test_an_input_that_nobody_gives_a_value_keeps_that_of_the_fmu(first, tmp_path):
+    """u is 7 in the FMU, whose description does not say so: x = 7 + 0.1 2 7 a step, as in FMPy."""
+    file = broken(first, tmp_path / "own.fmu", xml=[('<Real start="1.5" unit="m"/>', "<Real/>")])
+    system = of_one(file)
+    system.record("r", ["a.x"])
+    found = simulate(system, members=2, duration="0.2").dataset["a.x"].values
+    assert found == pytest.approx(np.array([[7.0] * 2, [8.4] * 2, [9.8] * 2]))
+    theirs = fmpy.simulate_fmu(
+        str(file), start_time=0.0, stop_time=0.2, step_size=0.1, output_interval=0.1
+    )
+    assert theirs["x"] == pytest.approx(found[:, 0])
 
 
 def test_a_ring_starts_from_start_values_and_check_says_so(first):
