@@ -275,7 +275,7 @@ class Instance:
     def __init__(self, library: Library, name: str, *, event_mode: bool = False) -> None:
         self.library = library
         self._event_mode = event_mode
-        self._next_event: float | None = None
+        self.next_event: float | None = None  # in event mode of co-simulation [s]
         self._version = library.version
         self._environment = self.environment = Instance._next
         Instance._next += 1
@@ -360,7 +360,7 @@ class Instance:
             self._update()
 
     def _update(self) -> None:
-        _, self._next_event = self.discrete_update()
+        _, self.next_event = self.discrete_update()
         self.call("EnterStepMode")
 
     def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
@@ -491,7 +491,7 @@ class Instance:
         """Step to a time, stopping at events: where the FMU returns, and where it asked to."""
         tolerance, standing = 1e-9 * (end - t), 0
         while end - t > tolerance:
-            due = self._next_event
+            due = self.next_event
             stop = end if due is None or due > end - tolerance else max(due, t)
             begun, event = t, False
             if stop > t:

@@ -525,18 +525,43 @@ class Fleet:
 
     def save(self) -> list[bytes]:
         """The state of every instance, as bytes; empty where there is none."""
-        pairs = zip(self.instances, self._failed, strict=True)
-        return [b"" if i is None or failed else i.serialize() for i, failed in pairs]
+        pairs = enumerate(zip(self.instances, self._failed, strict=True))
+        return [
+            b"" if i is None or failed else self._events_of(row) + i.serialize()
+            for row, (i, failed) in pairs
+        ]
+
+    @property
+    def _handles_events(self) -> bool:
+        return self.setup.kind != CO_SIMULATION or self.setup.event_mode
+
+    def _events_of(self, row: int) -> bytes:
+        """What a master knows of a member's events: the next time (NaN: none), discrete inputs."""
+        if not self._handles_events:
+            return b""
+        due = self._scheduler(row).next_event
+        return np.float64(np.nan if due is None else due).tobytes() + self._last[row].tobytes()
+
+    def _scheduler(self, row: int) -> Instance | Integrator:
+        """What holds the time of a member's next event."""
+        found = self._integrators.get(row) or self.instances[row]
+        assert found is not None
+        return found
 
     def restore(self, saved: Sequence[bytes]) -> None:
         """Return to what `save` gave."""
         for row, data in enumerate(saved):
             instance = self.instances[row]
             if data and instance is not None:
-                instance.deserialize(bytes(data))
+                size = 8 * (1 + len(self._discrete)) if self._handles_events else 0
+                events = np.frombuffer(data[:size], np.int64)
+                instance.deserialize(bytes(data[size:]))
                 if row in self._integrators:
                     self._integrators[row].restart()
-                self._last.pop(row, None)  # discrete inputs are set anew
+                if size:
+                    due = float(events[:1].view(np.float64)[0])
+                    self._scheduler(row).next_event = None if np.isnan(due) else due
+                    self._last[row] = events[1:].copy()
 
     def mark(self) -> None:
         """Keep the present state of every instance that is stepped, to return to."""

@@ -17,7 +17,7 @@ HEAD = """
 """
 
 
-def make_fmu(path, source, description, *, fmi, defines=""):
+def make_fmu(path, source, description, *, fmi, defines="", attributes=""):
     """Write an FMU of one C file; `description` is what stands in fmiModelDescription."""
     binary = build({"model.c": HEAD + defines + source}, ["model.c"], (None,))[host_platform()]
     names = {
@@ -26,7 +26,8 @@ def make_fmu(path, source, description, *, fmi, defines=""):
         2: 'fmiVersion="2.0" guid="t"',
         3: 'fmiVersion="3.0" instantiationToken="t"',
     }
-    xml = f'<fmiModelDescription {names[fmi]} modelName="m">{description}</fmiModelDescription>'
+    head = f'fmiModelDescription {names[fmi]} modelName="m" {attributes}'
+    xml = f"<{head}>{description}</fmiModelDescription>"
     host = host_platform()
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", xml)
@@ -291,6 +292,125 @@ def strict(path, *, n_states, ends=False, stuck=False):
     defines = f"#define NX {n_states}\n#define ENDS {int(ends)}\n#define STUCK {int(stuck)}\n"
     xml = STRICT_XML.replace("STATES", states)
     return make_fmu(path, STRICT, xml, fmi=2, defines=defines)
+
+
+# ------------------------------------------------------------------ a bouncing ball, FMI 2
+
+BALL = """
+struct m { double t, h, v, last, due; int bounces, ticks, entered, continuous; };
+struct info { int again, end, nominals, states, defined; double time; };
+static struct m *of(void *c) { return c; }
+F void *fmi2Instantiate(const char *a, int b, const char *c, const char *d, const void *e, int f,
+                        int g)
+{
+    struct m *i = calloc(1, sizeof *i);
+    i->h = 1.0, i->due = 0.25;
+    return i;
+}
+F void fmi2FreeInstance(void *c) { free(c); }
+F int fmi2SetupExperiment(void *c, int a, double b, double d, int e, double f) { return 0; }
+F int fmi2EnterInitializationMode(void *c) { return 0; }
+F int fmi2ExitInitializationMode(void *c) { return 0; }
+F int fmi2Terminate(void *c) { return 0; }
+F int fmi2EnterEventMode(void *c)
+{
+    if (!of(c)->continuous) return 3;
+    of(c)->continuous = 0, of(c)->entered++;
+    return 0;
+}
+F int fmi2EnterContinuousTimeMode(void *c) { of(c)->continuous = 1; return 0; }
+F int fmi2NewDiscreteStates(void *c, struct info *e)
+{
+    struct m *i = c;
+    memset(e, 0, sizeof *e);
+    if (i->h <= 0.0 && i->v < 0.0) {
+        i->h = 0.0, i->v *= -0.7, i->last = i->t, i->bounces++;
+        e->states = 1;
+    }
+    if (i->t >= i->due) i->ticks++, i->due += 0.25;
+    e->defined = 1, e->time = i->due;
+    return 0;
+}
+F int fmi2CompletedIntegratorStep(void *c, int a, int *event, int *end)
+{
+    *event = *end = 0;
+    return 0;
+}
+F int fmi2SetTime(void *c, double t) { of(c)->t = t; return 0; }
+F int fmi2GetContinuousStates(void *c, double *x, size_t n)
+{
+    x[0] = of(c)->h, x[1] = of(c)->v;
+    return 0;
+}
+F int fmi2SetContinuousStates(void *c, const double *x, size_t n)
+{
+    of(c)->h = x[0], of(c)->v = x[1];
+    return of(c)->continuous ? 0 : 3;
+}
+F int fmi2GetDerivatives(void *c, double *x, size_t n)
+{
+    x[0] = of(c)->v, x[1] = -10.0;
+    return 0;
+}
+F int fmi2GetNominalsOfContinuousStates(void *c, double *x, size_t n)
+{
+    x[0] = x[1] = 1.0;
+    return 0;
+}
+F int fmi2GetEventIndicators(void *c, double *x, size_t n) { x[0] = of(c)->h; return 0; }
+F int fmi2SetReal(void *c, const uint32_t *vr, size_t n, const double *v) { return 3; }
+F int fmi2GetReal(void *c, const uint32_t *vr, size_t n, double *v)
+{
+    struct m *i = c;
+    double y[] = {i->h, i->v, i->last, i->bounces, i->ticks, i->entered};
+    for (size_t j = 0; j < n; j++) v[j] = y[vr[j]];
+    return 0;
+}
+F int fmi2GetFMUstate(void *c, void **s)
+{
+    if (!*s) *s = malloc(sizeof(struct m));
+    memcpy(*s, c, sizeof(struct m));
+    return 0;
+}
+F int fmi2SetFMUstate(void *c, void *s) { memcpy(c, s, sizeof(struct m)); return 0; }
+F int fmi2FreeFMUstate(void *c, void **s) { free(*s); *s = NULL; return 0; }
+F int fmi2SerializedFMUstateSize(void *c, void *s, size_t *n) { *n = sizeof(struct m); return 0; }
+F int fmi2SerializeFMUstate(void *c, void *s, char *b, size_t n) { memcpy(b, s, n); return 0; }
+F int fmi2DeSerializeFMUstate(void *c, const char *b, size_t n, void **s)
+{
+    *s = malloc(n);
+    memcpy(*s, b, n);
+    return 0;
+}
+"""
+
+BALL_XML = (
+    """
+<ModelExchange modelIdentifier="m" canGetAndSetFMUstate="true" canSerializeFMUstate="true"/>
+<ModelVariables>"""
+    + "".join(
+        f'<ScalarVariable name="{name}" valueReference="{k}" causality="output">'
+        "<Real/></ScalarVariable>"
+        for k, name in enumerate(["h", "v", "last", "bounces", "ticks", "entered"])
+    )
+    + """
+  <ScalarVariable name="der(h)" valueReference="1"><Real derivative="1"/></ScalarVariable>
+  <ScalarVariable name="der(v)" valueReference="7"><Real derivative="2"/></ScalarVariable>
+</ModelVariables>
+<ModelStructure><Outputs><Unknown index="1"/><Unknown index="2"/><Unknown index="3"/>
+<Unknown index="4"/><Unknown index="5"/><Unknown index="6"/></Outputs>
+<Derivatives><Unknown index="7"/><Unknown index="8"/></Derivatives></ModelStructure>
+"""
+)
+
+
+def ball(path):
+    """Write a ball that falls from 1 m (g = 10 m/s2) and keeps 0.7 of its speed when it bounces.
+
+    It also asks for a time event (ticks) every 0.25 s, and counts how often event mode is entered.
+    """
+    more = 'numberOfEventIndicators="1"'
+    return make_fmu(path, BALL, BALL_XML, fmi=2, attributes=more)
 
 
 # ------------------------------------------------------------------ co-simulation that ends itself

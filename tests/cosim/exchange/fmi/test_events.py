@@ -73,6 +73,62 @@ def test_an_fmu_that_asks_for_an_event_again_and_again(tmp_path):
         simulate(driven(file), duration="1")
 
 
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    return eventful.ball(tmp_path_factory.mktemp("balls") / "ball.fmu")
+
+
+def bouncing(file, **options):
+    with System("bouncing") as system:
+        system.add(Fmu(file=file, rate=Rate("0.1"), **options), "ball")
+        names = ("h", "v", "last", "bounces", "ticks", "entered")
+        system.record("history", [f"ball.{name}" for name in names])
+    return system
+
+
+@pytest.mark.parametrize(("solver", "error"), [("cvode", 1e-7), ("dop853", 1e-13)])
+def test_a_ball_bounces_when_it_should(ball, solver, error):
+    """It falls for t1 = sqrt(2 / g); the n-th bounce is 2 t1 (0.7 + ... + 0.7^(n - 1)) later.
+
+    Until 2 s there are four (0.447, 1.073, 1.512, 1.818 s), and eight time events.
+    """
+    found = simulate(bouncing(ball, solver=solver), duration="2").dataset
+    first = np.sqrt(0.2)
+    times = first * (1.0 + 2.0 * np.cumsum([0.0, *0.7 ** np.arange(1, 9)]))
+    t = np.arange(21) / 10
+    n = np.searchsorted(times, t)
+    since = t - np.where(n > 0, times[n - 1], 0.0)
+    speed = np.where(n > 0, 10.0 * first * 0.7**n, 0.0)
+    height = np.where(n > 0, 0.0, 1.0) + speed * since - 5.0 * since**2
+    assert found["ball.bounces"].values[:, 0].tolist() == n.tolist()
+    assert n[-1] == 4
+    last = np.where(n > 0, times[n - 1], 0.0)
+    assert found["ball.last"].values[:, 0] == pytest.approx(last, abs=error)
+    assert found["ball.h"].values[:, 0] == pytest.approx(height, abs=20 * error)
+    assert found["ball.ticks"].values[-1, 0] == 8
+
+
+@pytest.mark.parametrize(("solver", "error"), [("cvode", 1e-7), ("dop853", 0.0)])
+def test_a_restored_model_goes_on_without_an_event_of_its_own(ball, tmp_path, solver, error):
+    """The time of its next event is restored with its state: event mode is entered as often.
+
+    CVode begins anew where it is restored; DOP853 does so in each step.
+    """
+    whole = Simulation(bouncing(ball, solver=solver))
+    whole.run_until("1.1")
+    write_checkpoint(tmp_path / "run.ckpt", whole.get_state())
+    other = Simulation(bouncing(ball, solver=solver))
+    other.set_state(read_checkpoint(tmp_path / "run.ckpt"))
+    for simulation in (whole, other):
+        simulation.run_until("2")
+    found = [s.get_state() for s in (whole, other)]
+    outputs = [s["master"]["components"]["ball"]["extra"]["outputs"] for s in found]
+    assert outputs[1][0, 3:].tolist() == outputs[0][0, 3:].tolist() == [4, 8, 12]
+    assert outputs[1][0] == pytest.approx(outputs[0][0], rel=0.0, abs=error)
+    for simulation in (whole, other):
+        simulation.master.terminate()
+
+
 # ------------------------------------------------------------------ co-simulation with FMI 3
 
 
