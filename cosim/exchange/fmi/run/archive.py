@@ -14,6 +14,7 @@ from xml.parsers import expat
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.basics.scratch import scratch_folder
+from terrafix.cosim.exchange.fmi.run.clocks import ClockSaid, read_clocks
 from terrafix.cosim.exchange.fmi.run.platforms import host_platform
 
 MOST_BYTES = 4 << 30
@@ -39,6 +40,8 @@ class Archive:
         What terrafix wrote about the ports of an FMU of its own.
     negated : frozenset of str
         Variables of FMI 1 whose value is that of another one, negated.
+    clocks : tuple of ClockSaid
+        Input clocks of FMI 3.
     """
 
     path: Path
@@ -48,6 +51,7 @@ class Archive:
     directional: bool = False
     annotation: Any = field(default=None, repr=False)
     negated: frozenset[str] = frozenset()
+    clocks: tuple[ClockSaid, ...] = ()
 
     def binary(self, identifier: str) -> Path:
         """The binary for this machine.
@@ -268,4 +272,5 @@ def _read(file: Path, folder: Path) -> Archive:
     )
     annotation = next(root.iter("Interface"), None)
     number = int(version[0])
-    return Archive(file, folder, description, number, directional, annotation, negated)
+    clocks = read_clocks(root) if number == 3 else ()
+    return Archive(file, folder, description, number, directional, annotation, negated, clocks)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
 from terrafix.cosim.exchange.fmi.run.archive import Archive
+from terrafix.cosim.exchange.fmi.run.clocks import Clocks
 from terrafix.cosim.exchange.fmi.run.whole import limits
 
 CO_SIMULATION, MODEL_EXCHANGE = "co-simulation", "model exchange"
@@ -271,12 +272,14 @@ class Instance:
     """
 
     _next = 1
+    _start = 0.0
 
     def __init__(self, library: Library, name: str, *, event_mode: bool = False) -> None:
         self.library = library
         self._event_mode = event_mode
         self.next_event: float | None = None  # in event mode of co-simulation [s]
         self._version = library.version
+        self.clocks = Clocks(library.archive.clocks)
         self._environment = self.environment = Instance._next
         Instance._next += 1
         _messages[self._environment] = []
@@ -345,6 +348,8 @@ class Instance:
     def begin(self, t: float, tolerance: float | None = None) -> None:
         """Enter initialization mode at a time [s]; with the tolerance of its own solver, if any."""
         none, time = ct.c_double(0.0), ct.c_double(t)
+        self._start = t
+        self.clocks.begin(t)
         given = ct.c_double(tolerance or 0.0)
         if self._version == 2:
             self.call("SetupExperiment", int(bool(tolerance)), given, time, 0, none)
@@ -357,19 +362,28 @@ class Instance:
         """Leave initialization mode."""
         self.call("ExitInitializationMode")
         if self._event_mode:
-            self._update()
+            self._update(self._start)
 
-    def _update(self) -> None:
-        _, self.next_event = self.discrete_update()
+    def _update(self, t: float) -> None:
+        self.next_event = self.events_at(t)
         self.call("EnterStepMode")
+
+    def events_at(self, t: float) -> float | None:
+        """Let clocks tick and update discrete states, in event mode; the time of the next event."""
+        if self.clocks:
+            self.clocks.tick(self, t)
+        _, due = self.discrete_update()
+        if self.clocks:
+            self.clocks.update(self, t)
+            due = min((x for x in (due, self.clocks.next) if x is not None), default=None)
+        return due
 
     def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
         """Handle events of co-simulation (FMI 3), and what `change` sets in event mode."""
-        del t  # the FMU knows it
         self.call("EnterEventMode")
         if change is not None:
             change()
-        self._update()
+        self._update(t)
 
     def reset(self) -> None:
         """Return to the state after instantiation."""

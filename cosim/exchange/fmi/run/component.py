@@ -203,8 +203,8 @@ class Fmu(Telling):
         left_out = [name for name in found.left_out if name not in {*clocks, *negated}]
         if left_out:
             notes += (f"{', '.join(left_out)} cannot be connected: no numbers",)
-        if clocks:
-            notes += (f"its clocks {', '.join(clocks)} never tick: terrafix drives no clocks",)
+        if silent := found.silent_clocks:
+            notes += (f"its clocks {', '.join(silent)} never tick: nothing here triggers them",)
         self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
 
     def _prepare_fmi1(self) -> None:

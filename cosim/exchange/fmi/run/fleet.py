@@ -536,11 +536,13 @@ class Fleet:
         return self.setup.kind != CO_SIMULATION or self.setup.event_mode
 
     def _events_of(self, row: int) -> bytes:
-        """What a master knows of a member's events: the next time (NaN: none), discrete inputs."""
-        if not self._handles_events:
+        """What a master knows of events: the next time (NaN: none), discrete inputs, clocks."""
+        instance = self.instances[row]
+        if not self._handles_events or instance is None:
             return b""
         due = self._scheduler(row).next_event
-        return np.float64(np.nan if due is None else due).tobytes() + self._last[row].tobytes()
+        head = np.float64(np.nan if due is None else due).tobytes()
+        return head + self._last[row].tobytes() + instance.clocks.state().tobytes()
 
     def _scheduler(self, row: int) -> Instance | Integrator:
         """What holds the time of a member's next event."""
@@ -553,7 +555,8 @@ class Fleet:
         for row, data in enumerate(saved):
             instance = self.instances[row]
             if data and instance is not None:
-                size = 8 * (1 + len(self._discrete)) if self._handles_events else 0
+                n = len(self._discrete)
+                size = 8 * (1 + n + 3 * len(instance.clocks)) if self._handles_events else 0
                 events = np.frombuffer(data[:size], np.int64)
                 instance.deserialize(bytes(data[size:]))
                 if row in self._integrators:
@@ -561,7 +564,8 @@ class Fleet:
                 if size:
                     due = float(events[:1].view(np.float64)[0])
                     self._scheduler(row).next_event = None if np.isnan(due) else due
-                    self._last[row] = events[1:].copy()
+                    self._last[row] = events[1 : 1 + n].copy()
+                    instance.clocks.restore(events[1 + n :].view(np.float64).reshape(-1, 3))
 
     def mark(self) -> None:
         """Keep the present state of every instance that is stepped, to return to."""

@@ -25,8 +25,6 @@ _NO, _YES = ct.c_uint8(0), ct.c_uint8(1)
 class InstanceOfFmi1(Instance):
     """One instance of an FMU of FMI 1.0."""
 
-    _start = 0.0
-
     def __init__(self, library: Library, name: str, *, event_mode: bool = False) -> None:
         super().__init__(library, name, event_mode=event_mode)
         assert self.pointer is not None

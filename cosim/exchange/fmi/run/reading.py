@@ -19,6 +19,7 @@ from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import SI_BASE, check_unit, unit_by_definition, unit_by_name
 from terrafix.cosim.exchange.fmi.run.archive import Archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
+from terrafix.cosim.exchange.fmi.run.clocks import TRIGGERED
 from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, whole_start
 from terrafix.cosim.memory.fields import Field, Unit
 
@@ -177,8 +178,13 @@ class Interface:
     @property
     def input_clocks(self) -> list[str]:
         """Clocks that its environment should let tick."""
-        variables = self.archive.description.modelVariables
-        return [v.name for v in variables if v.type == "Clock" and v.causality == "input"]
+        return [clock.name for clock in self.archive.clocks]
+
+    @property
+    def silent_clocks(self) -> list[str]:
+        """Those that never tick here: triggered ones, and all where there is no event mode."""
+        driven = self.kind != CO_SIMULATION or self.event_mode
+        return [c.name for c in self.archive.clocks if c.kind == TRIGGERED or not driven]
 
     @property
     def said_of_parameters(self) -> list[Any]:

@@ -66,7 +66,7 @@ class Integrator:
         self._n = self._count("GetNumberOfContinuousStates", len(description.derivatives))
         n_indicators = description.numberOfEventIndicators or len(description.eventIndicators)
         self._n_indicators = self._count("GetNumberOfEventIndicators", n_indicators)
-        self._events()  # it is in event mode since its initialization, and knows the time
+        self._events(t)  # it is in event mode since its initialization, and knows the time
         self._cvode: Any = None
         if solver == "cvode" and (self._n or self._n_indicators):
             self._cvode = self._make_cvode(t)
@@ -78,9 +78,9 @@ class Integrator:
         self._fmu.call(name, ct.byref(n))
         return int(n.value)
 
-    def _events(self) -> None:
+    def _events(self, t: float) -> None:
         """Handle events of the present time, in event mode already."""
-        _, self.next_event = self._fmu.discrete_update()
+        self.next_event = self._fmu.events_at(t)
         self._fmu.call("EnterContinuousTimeMode")
 
     def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
@@ -92,7 +92,7 @@ class Integrator:
         self._fmu.call("EnterEventMode")
         if change is not None:
             change()
-        self._events()
+        self._events(t)
         if not np.array_equal(before, self._moment()):
             self.restart(t)
 

@@ -600,3 +600,123 @@ STEPPING_XML = """
 def stepping(path):
     """Write a co-simulation that runs with event mode alone, and refuses what a mode forbids."""
     return make_fmu(path, STEPPING, STEPPING_XML, fmi=3)
+
+
+# ------------------------------------------------------------------ input clocks, FMI 3
+
+CLOCKED = """
+enum { START, INIT, EVENT, RUN };
+struct m { int mode, active, asked, period, late; double t, last_period, last_late; };
+static struct m *of(void *c) { return c; }
+F void *fmi3InstantiateCoSimulation(const char *a, const char *b, const char *c, bool d, bool e,
+    bool events, bool early, const uint32_t h[], size_t i, void *j, void *k, void *l)
+{
+    return events ? calloc(1, sizeof(struct m)) : NULL;
+}
+F void *fmi3InstantiateModelExchange(const char *a, const char *b, const char *c, bool d, bool e,
+                                     void *f, void *g)
+{
+    return calloc(1, sizeof(struct m));
+}
+F void fmi3FreeInstance(void *c) { free(c); }
+F int fmi3EnterInitializationMode(void *c, bool a, double b, double start, bool e, double f)
+{
+    of(c)->t = start;
+    return 0;
+}
+F int fmi3ExitInitializationMode(void *c) { of(c)->mode = EVENT; return 0; }
+F int fmi3Terminate(void *c) { return 0; }
+static int enter(struct m *i, int from, int to)
+{
+    if (i->mode != from) return 3;
+    i->mode = to;
+    return 0;
+}
+F int fmi3EnterEventMode(void *c) { return enter(c, RUN, EVENT); }
+F int fmi3EnterStepMode(void *c) { return enter(c, EVENT, RUN); }
+F int fmi3EnterContinuousTimeMode(void *c) { return enter(c, EVENT, RUN); }
+F int fmi3SetClock(void *c, const uint32_t *vr, size_t n, const bool *v)
+{
+    if (of(c)->mode != EVENT) return 3;
+    for (size_t j = 0; j < n; j++) of(c)->active |= v[j] ? 1 << vr[j] : 0;
+    return 0;
+}
+F int fmi3GetIntervalDecimal(void *c, const uint32_t *vr, size_t n, double *interval, int *qualifier)
+{
+    if (n != 1 || vr[0] != 2) return 3; /* of the constant clock, the description says it */
+    interval[0] = 0.05, qualifier[0] = of(c)->asked ? 2 : 1;
+    of(c)->asked = 0;
+    return 0;
+}
+F int fmi3UpdateDiscreteStates(void *c, bool *again, bool *end, bool *nominals, bool *states,
+                               bool *defined, double *next)
+{
+    struct m *i = c;
+    if (i->mode != EVENT) return 3;
+    *again = *end = *nominals = *states = *defined = false;
+    if (i->active & 1 << 1) i->period++, i->last_period = i->t, i->asked = i->period % 2;
+    if (i->active & 1 << 2) i->late++, i->last_late = i->t;
+    i->active = 0;
+    return 0;
+}
+F int fmi3DoStep(void *c, double t, double h, bool a, bool *event, bool *end, bool *early,
+                 double *last)
+{
+    *event = *end = *early = false;
+    *last = of(c)->t = t + h;
+    return of(c)->mode == RUN ? 0 : 3;
+}
+F int fmi3SetTime(void *c, double t) { of(c)->t = t; return 0; }
+F int fmi3CompletedIntegratorStep(void *c, bool a, bool *event, bool *end)
+{
+    *event = *end = false;
+    return 0;
+}
+F int fmi3GetNumberOfContinuousStates(void *c, size_t *n) { *n = 0; return 0; }
+F int fmi3GetNumberOfEventIndicators(void *c, size_t *n) { *n = 0; return 0; }
+F int fmi3GetFloat64(void *c, const uint32_t *vr, size_t n, double *v, size_t m)
+{
+    struct m *i = c;
+    v[0] = i->period, v[1] = i->last_period, v[2] = i->late, v[3] = i->last_late;
+    return 0;
+}
+F int fmi3GetFMUState(void *c, void **s)
+{
+    if (!*s) *s = malloc(sizeof(struct m));
+    memcpy(*s, c, sizeof(struct m));
+    return 0;
+}
+F int fmi3SetFMUState(void *c, void *s) { memcpy(c, s, sizeof(struct m)); return 0; }
+F int fmi3FreeFMUState(void *c, void **s) { free(*s); *s = NULL; return 0; }
+F int fmi3SerializedFMUStateSize(void *c, void *s, size_t *n) { *n = sizeof(struct m); return 0; }
+F int fmi3SerializeFMUState(void *c, void *s, uint8_t *b, size_t n) { memcpy(b, s, n); return 0; }
+F int fmi3DeserializeFMUState(void *c, const uint8_t *b, size_t n, void **s)
+{
+    *s = malloc(n);
+    memcpy(*s, b, n);
+    return 0;
+}
+"""
+
+CLOCKED_XML = """
+<ModelExchange modelIdentifier="m" canGetAndSetFMUState="true" canSerializeFMUState="true"/>
+<CoSimulation modelIdentifier="m" hasEventMode="true" canGetAndSetFMUState="true"
+  canSerializeFMUState="true"/>
+<ModelVariables>
+  <Clock name="period" valueReference="1" causality="input" intervalVariability="constant"
+    intervalCounter="3" shiftCounter="1" resolution="10"/>
+  <Clock name="late" valueReference="2" causality="input" intervalVariability="countdown"/>
+  <Clock name="outside" valueReference="3" causality="input" intervalVariability="triggered"/>
+  <Float64 name="y" valueReference="4" causality="output"><Dimension start="4"/></Float64>
+</ModelVariables>
+<ModelStructure><Output valueReference="4"/></ModelStructure>
+"""
+
+
+def clocked(path):
+    """Write a model with a clock of 0.3 s from 0.1 s on, and one that ticks 0.05 s after every other.
+
+    y = (ticks, time of the last) of both. A third clock is triggered. Clocks are set in event mode
+    alone.
+    """
+    return make_fmu(path, CLOCKED, CLOCKED_XML, fmi=3)

@@ -151,8 +151,37 @@ def test_clocks_that_never_tick_are_told(tmp_path):
     file = eventful.make_fmu(tmp_path / "clock.fmu", eventful.STEPPING, xml, fmi=3)
     assert (
         driven(file).check().notes[1]
-        == "'part': its clocks c never tick: terrafix drives no clocks"
+        == "'part': its clocks c never tick: nothing here triggers them"
     )
+
+
+@pytest.mark.parametrize("kind", ["co-simulation", "model exchange"])
+def test_clocks_that_depend_on_time_tick(tmp_path, kind):
+    """Those of 0.3 s: at 0.1, 0.4, 0.7, ... 1.9 s; the countdown after the first, third, ... of them.
+
+    So at 0.15, 0.75, 1.35 and 1.95 s. A checkpoint at 0.6 s changes nothing.
+    """
+    file = eventful.clocked(tmp_path / "clocked.fmu")
+    with System("clocked") as system:
+        system.add(Fmu(file=file, rate=Rate("0.2"), kind=kind), "part")
+        system.record("history", ["part.y"])
+    assert (
+        "'part': its clocks outside never tick: nothing here triggers them" in system.check().notes
+    )
+    y = simulate(system, duration="2").dataset["part.y"].values[:, 0]
+    assert y[:, 0].tolist() == [0, 1, 2, 2, 3, 4, 4, 5, 6, 6, 7]
+    assert y[:, 2].tolist() == [0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4]
+    assert y[-1, [1, 3]] == pytest.approx([1.9, 1.95], abs=1e-12)
+    first = Simulation(system)
+    first.run_until("0.6")
+    state = first.get_state()
+    first.master.terminate()
+    second = Simulation(system)
+    second.set_state(state)
+    second.run_until("2")
+    after = second.get_state()["master"]["components"]["part"]["extra"]["outputs"]
+    second.master.terminate()
+    assert after[0].tolist() == y[-1].tolist()
 
 
 # ------------------------------------------------------------------ an FMU that ends its simulation
