@@ -17,9 +17,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from terrafix.cosim.basics.arrays import FloatArray
+from terrafix.cosim.basics.errors import ConfigurationError
 
 COUNTDOWN, TRIGGERED = "countdown", "triggered"
-_CHANGED = 2  # of fmi3IntervalQualifier
+_UNCHANGED, _CHANGED = 1, 2  # of fmi3IntervalQualifier
 _NEAR = 1e-9  # of an interval
 
 
@@ -108,10 +109,9 @@ class Clocks:
                 (ct.c_uint32 * 1)(c.said.reference), ct.c_size_t(1),
                 ct.byref(interval), ct.byref(qualifier),
             )  # fmt: skip
-            if qualifier.value == _CHANGED:
+            again = c.due is None and c.said.kind != COUNTDOWN and qualifier.value == _UNCHANGED
+            if again or qualifier.value == _CHANGED:
                 c.step, c.due = interval.value, t + interval.value
-            elif c.due is None and c.step and c.said.kind != COUNTDOWN:
-                c.due = t + c.step
 
     def state(self) -> FloatArray:
         """What `restore` takes: number of ticks, next time, interval, of each."""
@@ -139,7 +139,18 @@ def _read(element: Any) -> ClockSaid:
 
 def _seconds(element: Any, what: str) -> Fraction | None:
     """An interval or shift, written as decimal or as a count of 1 / resolution."""
-    if (decimal := element.get(f"{what}Decimal")) is not None:
-        return Fraction(decimal)
+    decimal = element.get(f"{what}Decimal")
     counter, resolution = element.get(f"{what}Counter"), element.get("resolution")
-    return None if None in (counter, resolution) else Fraction(int(counter), int(resolution))
+    if decimal is None and None in (counter, resolution):
+        return None
+    try:
+        found = Fraction(int(counter), int(resolution)) if decimal is None else Fraction(decimal)
+    except (ValueError, ArithmeticError):
+        found = Fraction(-1)
+    if found < 0 or (what == "interval" and not found):
+        said = decimal if decimal is not None else f"{counter} / {resolution}"
+        raise ConfigurationError(
+            f"the FMU says that the {what} of its clock '{element.get('name')}' is '{said}' s\n"
+            "  ask for another from the tool that wrote it"
+        )
+    return found

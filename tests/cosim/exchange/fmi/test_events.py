@@ -6,10 +6,11 @@ import eventful
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from fmu_helpers import broken
 
 from terrafix.cli import main
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import StepError
+from terrafix.cosim.basics.errors import ConfigurationError, StepError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Output
 from terrafix.cosim.engine.run import simulate
@@ -182,6 +183,13 @@ def test_clocks_that_depend_on_time_tick(tmp_path, kind):
     after = second.get_state()["master"]["components"]["part"]["extra"]["outputs"]
     second.master.terminate()
     assert after[0].tolist() == y[-1].tolist()
+
+
+def test_a_clock_without_a_sensible_interval_is_refused(tmp_path):
+    file = eventful.clocked(tmp_path / "clocked.fmu")
+    wrong = broken(file, tmp_path / "wrong.fmu", xml=[('"3" shift', '"0" shift')])
+    with pytest.raises(ConfigurationError, match=r"the interval of its clock 'period' is '0 / 10'"):
+        Fmu(file=wrong, rate=Rate("0.2")).prepare()
 
 
 # ------------------------------------------------------------------ an FMU that ends its simulation
