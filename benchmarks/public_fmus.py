@@ -19,9 +19,9 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import multiprocessing
+import os
 import re
-import subprocess
-import sys
 import tempfile
 import zipfile
 from collections import Counter
@@ -31,8 +31,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fmpy import extract, read_model_description, simulate_fmu
+from fmpy.simulation import Recorder, instantiate_fmu
+from fmpy.util import auto_interval
 from numpy.typing import NDArray
 
+import terrafix as tf
+from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.exchange.fmi.run.component import Fmu
+
+FORKS = multiprocessing.get_context("fork")
 STEPS = 200
 TOLERANCE = 1e-9
 SAME = 1e-6
@@ -46,9 +54,6 @@ COLUMNS = (
 
 def plan(file: Path) -> tuple[Any, Fraction, int, float]:
     """Description, step [s], number of steps, start time [s]."""
-    from fmpy import read_model_description
-    from fmpy.util import auto_interval
-
     description = read_model_description(str(file), validate=False)
     said = description.defaultExperiment
     start = float((said and said.startTime) or 0.0)
@@ -71,10 +76,6 @@ def outputs_of(description: Any) -> list[Any]:
 
 def run_here(file: Path, kind: str) -> dict[str, NDArray[Any]]:
     """Outputs by the FMU's names, a row for each step."""
-    import terrafix as tf
-    from terrafix.cosim.basics.clock import Rate
-    from terrafix.cosim.exchange.fmi.run.component import Fmu
-
     description, h, steps, start = plan(file)
     options = {} if kind == "CoSimulation" else {"tolerance": TOLERANCE}
     system = tf.System("one")
@@ -101,8 +102,6 @@ def run_here(file: Path, kind: str) -> dict[str, NDArray[Any]]:
 
 def run_there(file: Path, kind: str) -> dict[str, NDArray[Any]]:
     """The same, from FMPy."""
-    from fmpy import simulate_fmu
-
     description, h, steps, start = plan(file)
     names = [v.name for v in outputs_of(description)]
     events = kind == "CoSimulation" and getattr(description.coSimulation, "hasEventMode", False)
@@ -124,9 +123,6 @@ def run_there(file: Path, kind: str) -> dict[str, NDArray[Any]]:
 
 def run_at_our_times(file: Path, kind: str) -> dict[str, NDArray[Any]]:
     """The same, from FMPy's classes at times that are rounded once (co-simulation, FMI 2)."""
-    from fmpy import extract
-    from fmpy.simulation import Recorder, instantiate_fmu
-
     description, h, steps, start = plan(file)
     names = [v.name for v in outputs_of(description)]
     said = description.defaultExperiment
@@ -146,7 +142,11 @@ def run_at_our_times(file: Path, kind: str) -> dict[str, NDArray[Any]]:
 
 
 def one_side(side: str, file: Path, kind: str, target: Path) -> None:
-    """Run one side and keep what it found, or what it said."""
+    """Run one side and keep what it found, or what it said; in a process of its own."""
+    os.setsid()
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
     try:
         found = SIDES[side](file, kind)
     except Exception as error:
@@ -163,16 +163,18 @@ SIDES = {"here": run_here, "there": run_there, "at_our_times": run_at_our_times}
 def in_a_process(side: str, file: Path, kind: str, folder: Path) -> dict[str, Any] | str:
     """What one side found, or why it found nothing."""
     target = folder / f"{side}.npz"
-    command = [sys.executable, __file__, str(file), "--side", side, kind, str(target)]
-    try:
-        done = subprocess.run(command, capture_output=True, timeout=LIMIT, check=False)
-    except subprocess.TimeoutExpired:
+    process = FORKS.Process(target=one_side, args=(side, file, kind, target))
+    process.start()
+    process.join(LIMIT)
+    if process.is_alive():
+        process.kill()
+        process.join()
         return f"not done after {LIMIT:g} s"
     said, names = target.with_suffix(".txt"), target.with_suffix(".json")
     if said.exists():
         return said.read_text()
     if not names.exists():
-        return f"its process ended with status {done.returncode}"
+        return f"its process ended with status {process.exitcode}"
     with np.load(target) as arrays:
         return dict(zip(json.loads(names.read_text()), arrays.values(), strict=True))
 
@@ -251,12 +253,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("public_fmus.txt"))
     parser.add_argument("--only", default="")
-    parser.add_argument("--side", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.side:
-        side, kind, target = options.side
-        one_side(side, options.folder, kind, Path(target))
-        return
     seen: set[str] = set()
     table: dict[str, Counter[str]] = {}
     not_run: Counter[str] = Counter()
