@@ -11,8 +11,8 @@ step, to `SAME` relative and absolute. An FMU without a binary for this machine 
 
 FMPy's k-th time is the product of k and h, rounded; ours is k h, rounded once. Where co-simulation
 of FMI 2 differs, FMPy's own classes are stepped at our times too: if they give our numbers, the FMU
-depends on the last bit of t (column "rounding"). `simulate_fmu` lets no input clock of FMI 3 tick; an
-FMU with one that time lets tick, as it does here, and that differs stands under "clocks".
+depends on the last bit of t (column "rounding"). `simulate_fmu` lets no input clock of FMI 3 tick;
+an FMU with one that time lets tick, as it does here, and that differs stands under "clocks".
 """
 
 from __future__ import annotations
