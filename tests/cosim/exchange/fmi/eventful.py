@@ -323,6 +323,7 @@ F int fmi2NewDiscreteStates(void *c, struct info *e)
 {
     struct m *i = c;
     memset(e, 0, sizeof *e);
+    if (STILL && !i->bounces && i->t >= 1.0 / 3.0) i->last = i->t, i->bounces++;
     if (i->h <= 0.0 && i->v < 0.0) {
         i->h = 0.0, i->v *= -0.7, i->last = i->t, i->bounces++;
         e->states = 1;
@@ -357,7 +358,11 @@ F int fmi2GetNominalsOfContinuousStates(void *c, double *x, size_t n)
     x[0] = x[1] = 1.0;
     return 0;
 }
-F int fmi2GetEventIndicators(void *c, double *x, size_t n) { x[0] = of(c)->h; return 0; }
+F int fmi2GetEventIndicators(void *c, double *x, size_t n)
+{
+    x[0] = STILL ? 1.0 / 3.0 - of(c)->t : of(c)->h;
+    return 0;
+}
 F int fmi2SetReal(void *c, const uint32_t *vr, size_t n, const double *v) { return 3; }
 F int fmi2GetReal(void *c, const uint32_t *vr, size_t n, double *v)
 {
@@ -404,13 +409,18 @@ BALL_XML = (
 )
 
 
-def ball(path):
+def ball(path, *, still=False):
     """Write a ball that falls from 1 m (g = 10 m/s2) and keeps 0.7 of its speed when it bounces.
 
     It also asks for a time event (ticks) every 0.25 s, and counts how often event mode is entered.
+    If it lies still, it has no continuous states, and its indicator is 1/3 s - t.
     """
-    more = 'numberOfEventIndicators="1"'
-    return make_fmu(path, BALL, BALL_XML, fmi=2, attributes=more)
+    xml = BALL_XML
+    if still:
+        xml = xml.replace('<Unknown index="7"/><Unknown index="8"/>', "")
+        xml = xml.replace("<Derivatives></Derivatives>", "")
+    more, define = 'numberOfEventIndicators="1"', f"#define STILL {int(still)}\n"
+    return make_fmu(path, BALL, xml, fmi=2, attributes=more, defines=define)
 
 
 # ------------------------------------------------------------------ co-simulation that ends itself

@@ -109,6 +109,16 @@ def test_a_ball_bounces_when_it_should(ball, solver, error):
     assert found["ball.ticks"].values[-1, 0] == 8
 
 
+@pytest.mark.parametrize("solver", ["cvode", "dop853"])
+def test_an_event_indicator_of_time_alone(tmp_path, solver):
+    """Without continuous states, it passes 0 at 1/3 s; event mode is entered there, and every 0.25 s."""
+    file = eventful.ball(tmp_path / "still.fmu", still=True)
+    found = simulate(bouncing(file, solver=solver), duration="0.6").dataset
+    assert found["ball.last"].values[-1, 0] == pytest.approx(1 / 3, abs=1e-12)
+    assert found["ball.bounces"].values[:, 0].tolist() == [0, 0, 0, 0, 1, 1, 1]
+    assert found["ball.entered"].values[-1, 0] == 3
+
+
 @pytest.mark.parametrize(("solver", "error"), [("cvode", 1e-7), ("dop853", 0.0)])
 def test_a_restored_model_goes_on_without_an_event_of_its_own(ball, tmp_path, solver, error):
     """The time of its next event is restored with its state: event mode is entered as often.
