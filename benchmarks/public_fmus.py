@@ -1,6 +1,6 @@
 """Other tools' FMUs here and in FMPy, each alone and unconnected: how many agree?
 
-    python benchmarks/public_fmus.py FOLDER [--out reasons.txt] [--only NAME]
+    python benchmarks/public_fmus.py FOLDER [--out reasons.txt] [--only NAME] [--limit 20]
 
 FOLDER holds .fmu files, at any depth; of files with the same content one is run. Every FMU runs
 once for each kind that it offers (co-simulation, model exchange), in processes of its own, here and
@@ -45,7 +45,6 @@ FORKS = multiprocessing.get_context("fork")
 STEPS = 200
 TOLERANCE = 1e-9
 SAME = 1e-6
-LIMIT = 20.0
 KINDS = {"CoSimulation": "co-simulation", "ModelExchange": "model exchange"}
 COLUMNS = (
     *(
@@ -178,16 +177,18 @@ def one_side(side: str, file: Path, kind: str, target: Path) -> None:
 SIDES = {"here": run_here, "there": run_there, "at_our_times": run_at_our_times}
 
 
-def in_a_process(side: str, file: Path, kind: str, folder: Path) -> dict[str, Any] | str:
+def in_a_process(
+    side: str, file: Path, kind: str, folder: Path, limit: float
+) -> dict[str, Any] | str:
     """What one side found, or why it found nothing."""
     target = folder / f"{side}.npz"
     process = FORKS.Process(target=one_side, args=(side, file, kind, target))
     process.start()
-    process.join(LIMIT)
+    process.join(limit)
     if process.is_alive():
         process.kill()
         process.join()
-        return f"not done after {LIMIT:g} s"
+        return f"not done after {limit:g} s"
     said, names = target.with_suffix(".txt"), target.with_suffix(".json")
     if said.exists():
         return said.read_text()
@@ -224,17 +225,17 @@ def compare(here: dict[str, Any], there: dict[str, Any]) -> tuple[str, str]:
     return ("within" if worst <= 1.0 else "differ"), where
 
 
-def judge(file: Path, kind: str, version: str) -> tuple[str, str]:
+def judge(file: Path, kind: str, version: str, limit: float) -> tuple[str, str]:
     """The column of a run, and what is to be said of it."""
     if version == "1.0" and kind == "ModelExchange":
         return "FMI 1 ME", ""
     with tempfile.TemporaryDirectory() as folder:
-        here = in_a_process("here", file, kind, Path(folder))
-        there = in_a_process("there", file, kind, Path(folder))
+        here = in_a_process("here", file, kind, Path(folder), limit)
+        there = in_a_process("there", file, kind, Path(folder), limit)
         if not isinstance(here, str) and not isinstance(there, str):
             column, said = compare(here, there)
             if column == "differ" and (version, kind) == ("2.0", "CoSimulation"):
-                again = in_a_process("at_our_times", file, kind, Path(folder))
+                again = in_a_process("at_our_times", file, kind, Path(folder), limit)
                 near = "" if isinstance(again, str) else compare(here, again)[0]
                 if near in ("equal", "within"):
                     column, said = "rounding", f"at our times {near} in FMPy; {said}"
@@ -273,6 +274,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("public_fmus.txt"))
     parser.add_argument("--only", default="")
+    parser.add_argument("--limit", type=float, default=20.0, help="of one side [s]")
     options = parser.parse_args()
     seen: set[str] = set()
     table: dict[str, Counter[str]] = {}
@@ -289,7 +291,7 @@ def main() -> None:
                 not_run[why] += 1
                 print(f"not run | {name} | FMI {version} | {tool} | {why}", file=out, flush=True)
             for kind in kinds:
-                column, said = judge(file, kind, version)
+                column, said = judge(file, kind, version, options.limit)
                 table.setdefault(tool, Counter())[column] += 1
                 what = f"{name} | FMI {version} | {kind} | {tool} | {said}"
                 print(f"{column} | {what}", file=out, flush=True)
