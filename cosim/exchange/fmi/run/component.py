@@ -205,6 +205,10 @@ class Fmu(Telling):
             notes += (f"{', '.join(left_out)} cannot be connected: no numbers",)
         if silent := found.silent_clocks:
             notes += (f"its clocks {', '.join(silent)} never tick: nothing here triggers them",)
+        if clocked := found.clocked_inputs:
+            notes += (
+                f"its inputs {', '.join(clocked)} are set when they change, not by their clocks",
+            )
         self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
 
     def _prepare_fmi1(self) -> None:

@@ -181,6 +181,13 @@ class Interface:
         return [clock.name for clock in self.archive.clocks]
 
     @property
+    def clocked_inputs(self) -> list[str]:
+        """Inputs that can be connected and belong to clocks."""
+        variables = self.archive.description.modelVariables
+        inputs = [v for v in variables if v.causality == "input" and v.type != "Clock"]
+        return [v.name for v in inputs if v.clocks and v.name not in self.left_out]
+
+    @property
     def silent_clocks(self) -> list[str]:
         """Those that never tick here: triggered ones, and all where there is no event mode."""
         driven = self.kind != CO_SIMULATION or self.event_mode

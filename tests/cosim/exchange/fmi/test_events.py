@@ -195,6 +195,17 @@ def test_clocks_that_depend_on_time_tick(tmp_path, kind):
     assert after[0].tolist() == y[-1].tolist()
 
 
+def test_inputs_of_clocks_are_told(tmp_path):
+    file = eventful.clocked(tmp_path / "clocked.fmu")
+    more = '<Float64 name="u" valueReference="9" causality="input" clocks="1" start="0"/>'
+    xml = [("</ModelVariables>", f"{more}</ModelVariables>")]
+    part = Fmu(file=broken(file, tmp_path / "more.fmu", xml=xml), rate=Rate("0.2"))
+    part.prepare()
+    assert (
+        part.capabilities.notes[-1] == "its inputs u are set when they change, not by their clocks"
+    )
+
+
 def test_a_clock_without_a_sensible_interval_is_refused(tmp_path):
     file = eventful.clocked(tmp_path / "clocked.fmu")
     wrong = broken(file, tmp_path / "wrong.fmu", xml=[('"3" shift', '"0" shift')])
