@@ -22,9 +22,15 @@ class Settling(Component):
     ----------
     known_at_start : frozenset of str or None
         Inputs that hold a value of t = 0 in `initialize`; None where nobody said.
+    undriven : frozenset of str
+        Inputs that nothing is connected to.
+    in_parts : bool
+        Whether it can give outputs before `initialize`.
     """
 
     known_at_start: frozenset[str] | None = None
+    undriven: frozenset[str] = frozenset()
+    in_parts = True
 
     def taken_at_start(self) -> set[str]:
         """Signal inputs that it takes before `initialize`, whenever a step reads them."""

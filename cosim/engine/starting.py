@@ -50,6 +50,9 @@ class Starter:
         ComponentError
             If one raises.
         """
+        for path, entry in self._entries.items():
+            if isinstance(entry.component, Settling):
+                entry.component.undriven = self._undriven(path)
         for stage in self._plan.start.stages:
             if isinstance(stage, str):
                 self._initialize(stage)
@@ -98,11 +101,13 @@ class Starter:
         assert isinstance(component, Settling)
         return component
 
+    def _undriven(self, path: str) -> frozenset[str]:
+        inputs = self._settling(path).inputs()
+        return frozenset(name for name in inputs if f"{path}.{name}" not in self._driven)
+
     def _take(self, path: str) -> set[str]:
         """Bring inputs up to what their sources publish, and say which have a value."""
-        found = {
-            name for name in self._settling(path).inputs() if f"{path}.{name}" not in self._driven
-        }
+        found = set(self._undriven(path))
         for link in self._plan.start.taken[path]:
             if link.source in self._published:
                 if (copy := self._wiring.copies.get(link.target)) is not None:

@@ -169,7 +169,9 @@ class _Cluster:
     def _source(self, connection: Connection) -> Node:
         """The node that publishes what a link carries."""
         path, _, name = connection.source.rpartition(".")
-        in_part = path in self._start.taken and self._flat.port(connection.source).kind == "signal"
+        component = self._flat.components[path]
+        in_part = isinstance(component, Settling) and component.in_parts
+        in_part = in_part and self._flat.port(connection.source).kind == "signal"
         return path, name if in_part else ""
 
     def _repeatable(self, part: Sequence[Node]) -> bool:

@@ -131,8 +131,8 @@ def _refuse(system: System, plan: Plan, paths: Sequence[str], leave_out: Sequenc
     for path in paths:
         component = plan.flat.components[path]
         if isinstance(component, Fmu):
-            if component.interface.archive.version != 2:
-                problems.append(f"'{path}' is an FMU of FMI 3: a package carries FMI 2")
+            if (version := component.interface.archive.version) != 2:
+                problems.append(f"'{path}' is an FMU of FMI {version}: a package carries FMI 2")
         elif not component.capabilities.symbolic:
             hint = "" if path in read else f" (nobody reads it: --leave-out {path})"
             problems.append(f"'{path}' is a {type(component).__name__}, written in Python{hint}")

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from terrafix.cosim.basics.errors import TerrafixError
+from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
 from terrafix.cosim.exchange.fmi.check.binary_checks import check_binaries
 from terrafix.cosim.exchange.fmi.check.findings import ERROR, NOTE, WARNING, Finding
-from terrafix.cosim.exchange.fmi.run.archive import open_archive
+from terrafix.cosim.exchange.fmi.run.archive import is_c_name, open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
 from terrafix.cosim.exchange.fmi.run.remote import FIRST_LIMIT, ProcessError, Worker
 
@@ -107,6 +107,11 @@ def check_fmu(
         If it is no FMU, of FMI 1, damaged or unsafe.
     """
     archive = open_archive(path)
+    if archive.version == 1:
+        raise ConfigurationError(
+            f"'{path}' is an FMU of FMI 1.0; terrafix runs it, and checks FMI 2 and 3 alone\n"
+            f"  FMPy validates its description: fmpy validate {path}"
+        )
     description = archive.description
     offered = {
         CO_SIMULATION: description.coSimulation,
@@ -122,6 +127,15 @@ def check_fmu(
                 "importers that validate refuse the FMU",
             )
         )  # fmt: skip
+    for identifier in {offered[kind].modelIdentifier for kind in kinds}:
+        if not is_c_name(identifier):
+            report.add(
+                Finding(
+                    "description", ERROR, "modelIdentifier",
+                    f"'{identifier}' is no name as in C",
+                    "functions of an FMU in C source code, and those of FMI 1, are named after it",
+                )
+            )  # fmt: skip
     report.checks.append("library")
     for found in check_binaries(archive):
         report.add(found)

@@ -117,9 +117,24 @@ def _live_as_a_fork(functions: Callable[[], dict[str, Any]], requests: int, answ
         for handle in handles - {0, 1, 2, requests, answers}:
             with suppress(OSError):  # that of the list itself
                 os.close(handle)
-        answer_requests(functions(), os.fdopen(requests, "rb"), os.fdopen(answers, "wb"))
+        try:
+            found = functions()
+        except TerrafixError as error:  # the binary cannot be loaded, say
+            found = _Refusing(error)
+        answer_requests(found, os.fdopen(requests, "rb"), os.fdopen(answers, "wb"))
     finally:
         os._exit(0)
+
+
+class _Refusing(dict[str, Any]):
+    """Functions none of which can be called, for one reason."""
+
+    def __init__(self, error: TerrafixError) -> None:
+        super().__init__()
+        self._error = error
+
+    def __missing__(self, name: str) -> Any:
+        raise self._error
 
 
 class FleetApart:
@@ -301,7 +316,8 @@ def rehearse(setup: Setup, inputs: FloatArray, h: float, limit: float) -> Distur
     ----------
     setup : Setup
     inputs : ndarray, shape (2, width)
-        Rows of the two. Real inputs move away from them, differently in each member.
+        Rows of the two. Real inputs move away from them, differently in each member; where the FMU
+        refuses that, they stand still, and where it refuses these, none is set.
     h : float
         Step [s].
     limit : float
@@ -313,9 +329,10 @@ def rehearse(setup: Setup, inputs: FloatArray, h: float, limit: float) -> Distur
         None also where it cannot be told: an FMU that fails alone, or is never twice the same.
     """
     _prepare(setup)
-    for moved in (True, False):
+    untouched = replace(setup, inputs=()), inputs[:, :0], False  # with the FMU's own inputs
+    for tried, rows, moved in ((setup, inputs, True), (setup, inputs, False), untouched):
         plays = [(0,)], [(0,)], [(1,)], [(0, 1)], [(0,), (0,)]
-        parts = [partial(_play, setup, inputs, h, play, moved) for play in plays]
+        parts = [partial(_play, tried, rows, h, play, moved) for play in plays]
         first, again, second, both, after = _played(parts, limit)
         if isinstance(first, str) or isinstance(second, str) or isinstance(again, str):
             continue  # it does not take these inputs

@@ -14,6 +14,7 @@ from xml.parsers import expat
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.basics.scratch import scratch_folder
+from terrafix.cosim.exchange.fmi.run.clocks import ClockSaid, read_clocks
 from terrafix.cosim.exchange.fmi.run.platforms import host_platform
 
 MOST_BYTES = 4 << 30
@@ -32,11 +33,15 @@ class Archive:
     folder : Path
         Where it was unpacked; removed when this process ends.
     description : fmpy.model_description.ModelDescription
-    version : {2, 3}
+    version : {1, 2, 3}
     directional : bool
         Whether it says that it has directional derivatives.
     annotation : Element or None
         What terrafix wrote about the ports of an FMU of its own.
+    negated : frozenset of str
+        Variables of FMI 1 whose value is that of another one, negated.
+    clocks : tuple of ClockSaid
+        Input clocks of FMI 3.
     """
 
     path: Path
@@ -45,6 +50,8 @@ class Archive:
     version: int
     directional: bool = False
     annotation: Any = field(default=None, repr=False)
+    negated: frozenset[str] = frozenset()
+    clocks: tuple[ClockSaid, ...] = ()
 
     def binary(self, identifier: str) -> Path:
         """The binary for this machine.
@@ -82,7 +89,7 @@ def open_archive(path: str | Path) -> Archive:
     Raises
     ------
     ConfigurationError
-        If it is absent, no FMU, of FMI 1, damaged, or unsafe to unpack.
+        If it is absent, no FMU, of FMI 1 for model exchange, damaged, or unsafe to unpack.
     """
     file = Path(path)
     try:
@@ -180,12 +187,34 @@ def checked_xml(path: Path, file: Path) -> bytes:
 
 
 def _check_identifier(identifier: str, tag: str, file: Path) -> None:
-    """It names a file: it must not lead elsewhere."""
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
+    """It names a file, which must lie in its folder.
+
+    FMI demands a name as in C; what other characters of a file's name do no harm are taken.
+    """
+    if not re.fullmatch(r"\w[\w.+ -]*", identifier, re.ASCII):
         raise ConfigurationError(
             f"'{file}': the modelIdentifier of {tag} is '{identifier}'; FMI demands letters, "
             "digits and underscores, no digit first\n  ask for another from the tool that wrote it"
         )
+
+
+def is_c_name(identifier: str) -> bool:
+    """Whether a modelIdentifier is what FMI demands: a name as in C."""
+    return bool(re.fullmatch(r"[A-Za-z_]\w*", identifier, re.ASCII))
+
+
+def _complete_fmi1(root: Any, description: Any, file: Path) -> frozenset[str]:
+    """Read of FMI 1 what FMPy leaves out: capabilities, and (returned) negated aliases."""
+    if description.coSimulation is None:
+        raise ConfigurationError(
+            f"'{file}' is an FMU of FMI 1.0 for model exchange; terrafix runs those of FMI 1.0 for "
+            "co-simulation alone\n  export it for co-simulation, or as FMI 2 or 3"
+        )
+    for said in root.iter("Capabilities"):
+        once = said.get("canBeInstantiatedOnlyOncePerProcess") in ("true", "1")
+        description.coSimulation.canBeInstantiatedOnlyOncePerProcess = once
+    variables = root.iter("ScalarVariable")
+    return frozenset(v.get("name", "") for v in variables if v.get("alias") == "negatedAlias")
 
 
 def _bound_unsigned(root: Any, description: Any) -> None:
@@ -208,10 +237,12 @@ def _read(file: Path, folder: Path) -> Archive:
         )
     root = ET.fromstring(checked_xml(xml, file))
     version = root.get("fmiVersion", "")
-    if not version.startswith(("2.0", "3.")):
+    draft = version.startswith("3.") and "-" in version
+    if draft or not version.startswith(("1.0", "2.0", "3.")):
         said = f"of FMI {version}" if version else "without a version of FMI"
+        said += ", a draft of the standard" if draft else ""
         raise ConfigurationError(
-            f"'{file}' is an FMU {said}; terrafix reads 2.0 and 3.0\n"
+            f"'{file}' is an FMU {said}; terrafix reads 1.0, 2.0 and 3.0\n"
             "  ask for another from the tool that wrote it"
         )
     from fmpy.model_description import read_model_description
@@ -225,6 +256,10 @@ def _read(file: Path, folder: Path) -> Archive:
             f"'{file}': modelDescription.xml cannot be understood: {why}\n"
             "  ask for another from the tool that wrote it"
         ) from error
+    negated: frozenset[str] = frozenset()
+    if version == "1.0":
+        _check_identifier(root.get("modelIdentifier", ""), "the FMU", file)
+        negated = _complete_fmi1(root, description, file)
     for tag in ("CoSimulation", "ModelExchange", "ScheduledExecution"):
         for each in root.iter(tag):
             _check_identifier(each.get("modelIdentifier", ""), tag, file)
@@ -236,4 +271,6 @@ def _read(file: Path, folder: Path) -> Archive:
         for name in ("providesDirectionalDerivatives", "providesDirectionalDerivative")
     )
     annotation = next(root.iter("Interface"), None)
-    return Archive(file, folder, description, int(version[0]), directional, annotation)
+    number = int(version[0])
+    clocks = read_clocks(root) if number == 3 else ()
+    return Archive(file, folder, description, number, directional, annotation, negated, clocks)

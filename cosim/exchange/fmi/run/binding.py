@@ -1,5 +1,7 @@
 """The C interface of FMI 2 and 3, as far as terrafix calls it, under one set of names.
 
+That of FMI 1 is in `terrafix.cosim.exchange.fmi.run.fmi1`.
+
 One `Library` for each binary, however many instances: loading it once for each instance exhausts
 the loader after a thousand. Status and messages of an instance become `FmuError`.
 """
@@ -22,6 +24,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
 from terrafix.cosim.exchange.fmi.run.archive import Archive
+from terrafix.cosim.exchange.fmi.run.clocks import Clocks
 from terrafix.cosim.exchange.fmi.run.whole import limits
 
 CO_SIMULATION, MODEL_EXCHANGE = "co-simulation", "model exchange"
@@ -35,6 +38,7 @@ _TYPES: dict[str, tuple[str, Any]] = {  # of the variable: (in function names, o
     "Integer": ("Integer", ct.c_int),
     "Enumeration2": ("Integer", ct.c_int),
     "Boolean2": ("Boolean", ct.c_int),
+    "Boolean1": ("Boolean", ct.c_uint8),
     "Float64": ("Float64", ct.c_double),
     "Float32": ("Float32", ct.c_float),
     "Int8": ("Int8", ct.c_int8),
@@ -129,6 +133,8 @@ class _EventInfo2(ct.Structure):
 
 
 _messages: dict[int, list[str]] = {}
+SPEAKERS: dict[Any, int] = {}
+"""Environments of instances that a message names by other means (FMI 1): pointer, or name."""
 HEARD: dict[int, list[tuple[int, str]]] = {}
 """By environment, what an instance logged, status and text, until a fleet takes it."""
 _MOST_HEARD = 100
@@ -145,7 +151,9 @@ def _note(environment: int | None, status: int, text: bytes | None) -> None:
 
 
 def _log_of_fmi2(environment: Any, name: Any, status: Any, category: Any, text: Any) -> None:
-    del name, category
+    del category
+    if SPEAKERS:
+        environment = SPEAKERS.get(environment, SPEAKERS.get(name, environment))
     _note(environment, status, text)
 
 
@@ -199,7 +207,8 @@ class Library:
         self.kind = kind
         self.version = archive.version
         self.interface = interface
-        self.prefix = f"fmi{archive.version}"
+        first = f"{interface.modelIdentifier}_fmi" if archive.version == 1 else ""
+        self.prefix = first or f"fmi{archive.version}"
         self.instantiated = False
         path = archive.binary(interface.modelIdentifier)
         here = Path.cwd()
@@ -263,16 +272,30 @@ class Instance:
     """
 
     _next = 1
+    _start = 0.0
 
     def __init__(self, library: Library, name: str, *, event_mode: bool = False) -> None:
         self.library = library
         self._event_mode = event_mode
-        self._next_event: float | None = None
+        self.next_event: float | None = None  # in event mode of co-simulation [s]
         self._version = library.version
+        self.clocks = Clocks(library.archive.clocks)
         self._environment = self.environment = Instance._next
         Instance._next += 1
         _messages[self._environment] = []
         self.pointer: ct.c_void_p | None = None
+        function, arguments = self._creation(name)
+        function.restype = ct.c_void_p
+        library.instantiated = True
+        with Kept():
+            made = function(*arguments)
+        if not made:
+            raise FmuError(f"the FMU could not be instantiated{self.said()}")
+        self.pointer = ct.c_void_p(made)
+
+    def _creation(self, name: str) -> tuple[Any, list[Any]]:
+        """The function that makes an instance, and its arguments."""
+        library, event_mode = self.library, self._event_mode
         token = library.archive.description.guid or ""
         resources = library.archive.folder / "resources"
         co_simulation = library.kind == CO_SIMULATION
@@ -299,13 +322,7 @@ class Instance:
                 arguments += [None, ct.c_size_t(0)]
             arguments += [ct.c_void_p(self._environment), _log3]
             arguments += [None] if co_simulation else []
-        function.restype = ct.c_void_p
-        library.instantiated = True
-        with Kept():
-            made = function(*arguments)
-        if not made:
-            raise FmuError(f"the FMU could not be instantiated{self.said()}")
-        self.pointer = ct.c_void_p(made)
+        return function, arguments
 
     def said(self) -> str:
         """What the FMU logged since it was last asked, for an error."""
@@ -331,6 +348,8 @@ class Instance:
     def begin(self, t: float, tolerance: float | None = None) -> None:
         """Enter initialization mode at a time [s]; with the tolerance of its own solver, if any."""
         none, time = ct.c_double(0.0), ct.c_double(t)
+        self._start = t
+        self.clocks.begin(t)
         given = ct.c_double(tolerance or 0.0)
         if self._version == 2:
             self.call("SetupExperiment", int(bool(tolerance)), given, time, 0, none)
@@ -343,19 +362,28 @@ class Instance:
         """Leave initialization mode."""
         self.call("ExitInitializationMode")
         if self._event_mode:
-            self._update()
+            self._update(self._start)
 
-    def _update(self) -> None:
-        _, self._next_event = self.discrete_update()
+    def _update(self, t: float) -> None:
+        self.next_event = self.events_at(t)
         self.call("EnterStepMode")
+
+    def events_at(self, t: float) -> float | None:
+        """Let clocks tick and update discrete states, in event mode; the time of the next event."""
+        if self.clocks:
+            self.clocks.tick(self, t)
+        _, due = self.discrete_update()
+        if self.clocks:
+            self.clocks.update(self, t)
+            due = min((x for x in (due, self.clocks.next) if x is not None), default=None)
+        return due
 
     def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
         """Handle events of co-simulation (FMI 3), and what `change` sets in event mode."""
-        del t  # the FMU knows it
         self.call("EnterEventMode")
         if change is not None:
             change()
-        self._update()
+        self._update(t)
 
     def reset(self) -> None:
         """Return to the state after instantiation."""
@@ -379,15 +407,14 @@ class Instance:
     # ------------------------------------------------------------------ variables
 
     def _type(self, kind: str) -> tuple[str, Any]:
-        if self._version == 2 and f"{kind}2" in _TYPES:
-            kind = f"{kind}2"
-        return _TYPES[kind]
+        own = "Enumeration2" if kind == "Enumeration" else f"{kind}{self._version}"
+        return _TYPES[own if self._version < 3 and own in _TYPES else kind]
 
     def get(self, kind: str, vr: Any, n: int) -> NDArray[Any]:
         """Values of variables of one type, `n` numbers in all."""
         name, ctype = self._type(kind)
         values = (ctype * max(n, 1))()
-        sizes = () if self._version == 2 else (ct.c_size_t(n),)
+        sizes = () if self._version < 3 else (ct.c_size_t(n),)
         self.call(f"Get{name}", vr, ct.c_size_t(len(vr)), values, *sizes)
         return np.array(values[:n])
 
@@ -402,7 +429,7 @@ class Instance:
         else:
             converted = self._wholes(kind, vr, flat)
         array = (ctype * max(len(flat), 1))(*converted)
-        sizes = () if self._version == 2 else (ct.c_size_t(len(flat)),)
+        sizes = () if self._version < 3 else (ct.c_size_t(len(flat)),)
         self.call(f"Set{name}", vr, ct.c_size_t(len(vr)), array, *sizes)
 
     def _wholes(self, kind: str, vr: Any, values: list[Any]) -> list[int]:
@@ -442,7 +469,7 @@ class Instance:
     def set_texts(self, vr: Any, texts: Sequence[str]) -> None:
         """Set variables of text."""
         array = (ct.c_char_p * max(len(texts), 1))(*(text.encode() for text in texts))
-        sizes = () if self._version == 2 else (ct.c_size_t(len(texts)),)
+        sizes = () if self._version < 3 else (ct.c_size_t(len(texts)),)
         self.call("SetString", vr, ct.c_size_t(len(vr)), array, *sizes)
 
     # ------------------------------------------------------------------ co-simulation
@@ -478,7 +505,7 @@ class Instance:
         """Step to a time, stopping at events: where the FMU returns, and where it asked to."""
         tolerance, standing = 1e-9 * (end - t), 0
         while end - t > tolerance:
-            due = self._next_event
+            due = self.next_event
             stop = end if due is None or due > end - tolerance else max(due, t)
             begun, event = t, False
             if stop > t:

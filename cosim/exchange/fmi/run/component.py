@@ -33,7 +33,7 @@ from terrafix.cosim.declare.ports import (
     Output,
     Port,
 )
-from terrafix.cosim.exchange.fmi.run.archive import open_archive
+from terrafix.cosim.exchange.fmi.run.archive import is_c_name, open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
 from terrafix.cosim.exchange.fmi.run.fleet import Group, Message, Setup
 from terrafix.cosim.exchange.fmi.run.parameters import (
@@ -64,7 +64,7 @@ from terrafix.cosim.memory.slots import BundleView
 
 
 class Fmu(Telling):
-    """A Functional Mock-up Unit, FMI 2 or 3, one instance for each member.
+    """A Functional Mock-up Unit, FMI 2 or 3 (1.0: co-simulation), one instance for each member.
 
     Ports, units, arrays and start values are those of its model description, and so are parameters,
     which are set by name like any other. Inputs of an FMU that does not say otherwise are read at
@@ -168,13 +168,12 @@ class Fmu(Telling):
         assert self._found is not None
         self._interface = found = self._found[1].copy()
         archive = found.archive
-        archive.binary(
-            (
-                archive.description.coSimulation
-                if found.kind == CO_SIMULATION
-                else archive.description.modelExchange
-            ).modelIdentifier
-        )
+        identifier = (
+            archive.description.coSimulation
+            if found.kind == CO_SIMULATION
+            else archive.description.modelExchange
+        ).modelIdentifier
+        archive.binary(identifier)
         self._observe()
         self._needs = None
         self._given = self._read_starts()
@@ -191,13 +190,34 @@ class Fmu(Telling):
         notes: tuple[str, ...] = ()
         if not found.serialize:
             notes = ("its state cannot be saved: no checkpoints",)
+        self.in_parts = archive.version > 1
+        if archive.version == 1:
+            self._prepare_fmi1()
+            notes = ("FMI 1.0 cannot save its state: no checkpoints",)
+        if not is_c_name(identifier):
+            notes += (f"its modelIdentifier '{identifier}' is no name as in C, which FMI demands",)
         clocks = found.input_clocks
-        left_out = [name for name in found.left_out if name not in clocks]
+        negated = [name for name in found.left_out if name in archive.negated]
+        if negated:
+            notes += (f"{', '.join(negated)} cannot be connected: negated aliases of FMI 1.0",)
+        left_out = [name for name in found.left_out if name not in {*clocks, *negated}]
         if left_out:
             notes += (f"{', '.join(left_out)} cannot be connected: no numbers",)
-        if clocks:
-            notes += (f"its clocks {', '.join(clocks)} never tick: terrafix drives no clocks",)
+        if silent := found.silent_clocks:
+            notes += (f"its clocks {', '.join(silent)} never tick: nothing here triggers them",)
+        if clocked := found.clocked_inputs:
+            notes += (
+                f"its inputs {', '.join(clocked)} are set when they change, not by their clocks",
+            )
         self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
+
+    def _prepare_fmi1(self) -> None:
+        """Refuse what FMI 1.0 has no function for."""
+        if self.given_parameters["tolerance"]:
+            raise ConfigurationError(
+                f"'{self.name}.tolerance' does nothing: FMI 1.0 hands no tolerance to an FMU for "
+                "co-simulation\n  leave it out"
+            )
 
     def _take_parameters_of_start(self) -> None:
         """Make values of ``start`` that are of parameters values of these."""
@@ -464,7 +484,13 @@ class Fmu(Telling):
         self._messages = [p for p in interface.ports if p.is_input and p.kind == "message"]
         self._outputs = [p for p in interface.ports if not p.is_input]
         self._published = [p for p in self._outputs if p.kind == "message"]
-        read = [(p.name, n, q) for p in self._inputs for n, (q, _) in p.fields.items()]
+        read = [
+            (p.name, n, q)
+            for p in self._inputs
+            for n, (q, _) in p.fields.items()
+            # what nobody gives a value keeps that of the FMU
+            if p.name not in self.undriven or q.start is not None or q.name in self._given
+        ]
         written = [(p.name, n, q) for p in self._outputs for n, (q, _) in p.fields.items()]
         written += [(p.name, "t", p.t) for p in self._outputs if p.t]
         written += [(p.name, "sequence", p.sequence) for p in self._outputs if p.sequence]

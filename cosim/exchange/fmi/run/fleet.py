@@ -32,6 +32,7 @@ from terrafix.cosim.exchange.fmi.run.binding import (
     load_library,
     references,
 )
+from terrafix.cosim.exchange.fmi.run.fmi1 import InstanceOfFmi1
 from terrafix.cosim.exchange.fmi.run.parameters import Start
 from terrafix.cosim.exchange.fmi.run.solvers import Integrator
 from terrafix.cosim.exchange.fmi.run.whole import INTEGER, MOST, cells
@@ -298,7 +299,8 @@ class Fleet:
 
     def _enter_one(self, row: int) -> None:
         name = f"{self.setup.name}_{row}"
-        instance = Instance(self.library, name, event_mode=self.setup.event_mode)
+        made = InstanceOfFmi1 if self.library.version == 1 else Instance
+        instance = made(self.library, name, event_mode=self.setup.event_mode)
         self.instances[row] = instance
         structural = [s for s in self.setup.starts if s.structural]
         if structural:
@@ -381,6 +383,8 @@ class Fleet:
         groups = (self.setup.inputs, self.setup.outputs)
         real = all(len(g) <= 1 and all(x.kind in _DOUBLE for x in g) for g in groups)
         if not real or self.setup.kind != CO_SIMULATION or self.setup.event_mode:
+            return
+        if self.library.version == 1:
             return
         self._quick = {
             row: _Quick(instance, self)
@@ -521,18 +525,47 @@ class Fleet:
 
     def save(self) -> list[bytes]:
         """The state of every instance, as bytes; empty where there is none."""
-        pairs = zip(self.instances, self._failed, strict=True)
-        return [b"" if i is None or failed else i.serialize() for i, failed in pairs]
+        pairs = enumerate(zip(self.instances, self._failed, strict=True))
+        return [
+            b"" if i is None or failed else self._events_of(row) + i.serialize()
+            for row, (i, failed) in pairs
+        ]
+
+    @property
+    def _handles_events(self) -> bool:
+        return self.setup.kind != CO_SIMULATION or self.setup.event_mode
+
+    def _events_of(self, row: int) -> bytes:
+        """What a master knows of events: the next time (NaN: none), discrete inputs, clocks."""
+        instance = self.instances[row]
+        if not self._handles_events or instance is None:
+            return b""
+        due = self._scheduler(row).next_event
+        head = np.float64(np.nan if due is None else due).tobytes()
+        return head + self._last[row].tobytes() + instance.clocks.state().tobytes()
+
+    def _scheduler(self, row: int) -> Instance | Integrator:
+        """What holds the time of a member's next event."""
+        found = self._integrators.get(row) or self.instances[row]
+        assert found is not None
+        return found
 
     def restore(self, saved: Sequence[bytes]) -> None:
         """Return to what `save` gave."""
         for row, data in enumerate(saved):
             instance = self.instances[row]
             if data and instance is not None:
-                instance.deserialize(bytes(data))
+                n = len(self._discrete)
+                size = 8 * (1 + n + 3 * len(instance.clocks)) if self._handles_events else 0
+                events = np.frombuffer(data[:size], np.int64)
+                instance.deserialize(bytes(data[size:]))
                 if row in self._integrators:
                     self._integrators[row].restart()
-                self._last.pop(row, None)  # discrete inputs are set anew
+                if size:
+                    due = float(events[:1].view(np.float64)[0])
+                    self._scheduler(row).next_event = None if np.isnan(due) else due
+                    self._last[row] = events[1 : 1 + n].copy()
+                    instance.clocks.restore(events[1 + n :].view(np.float64).reshape(-1, 3))
 
     def mark(self) -> None:
         """Keep the present state of every instance that is stepped, to return to."""

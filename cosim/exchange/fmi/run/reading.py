@@ -19,6 +19,7 @@ from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import SI_BASE, check_unit, unit_by_definition, unit_by_name
 from terrafix.cosim.exchange.fmi.run.archive import Archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
+from terrafix.cosim.exchange.fmi.run.clocks import TRIGGERED
 from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, whole_start
 from terrafix.cosim.memory.fields import Field, Unit
 
@@ -177,8 +178,20 @@ class Interface:
     @property
     def input_clocks(self) -> list[str]:
         """Clocks that its environment should let tick."""
+        return [clock.name for clock in self.archive.clocks]
+
+    @property
+    def clocked_inputs(self) -> list[str]:
+        """Inputs that can be connected and belong to clocks."""
         variables = self.archive.description.modelVariables
-        return [v.name for v in variables if v.type == "Clock" and v.causality == "input"]
+        inputs = [v for v in variables if v.causality == "input" and v.type != "Clock"]
+        return [v.name for v in inputs if v.clocks and v.name not in self.left_out]
+
+    @property
+    def silent_clocks(self) -> list[str]:
+        """Those that never tick here: triggered ones, and all where there is no event mode."""
+        driven = self.kind != CO_SIMULATION or self.event_mode
+        return [c.name for c in self.archive.clocks if c.kind == TRIGGERED or not driven]
 
     @property
     def said_of_parameters(self) -> list[Any]:
@@ -303,6 +316,9 @@ def _quantities(
     for variable in archive.description.modelVariables:
         causality = variable.causality or "local"
         if causality not in wanted:
+            continue
+        if variable.name in archive.negated:
+            left_out += [variable.name] if causality in CONNECTED else []
             continue
         text = variable.type == "String" and variable.causality in PARAMETERS
         if not text and variable.type not in (*REAL, *INTEGER, *BOOLEAN):

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from terrafix.cosim.basics.arrays import FloatArray
-from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.exchange.fmi.run.archive import Archive
 from terrafix.cosim.exchange.fmi.run.binding import MOST_EVENTS, FmuError, Instance
 
 SOLVERS = ("cvode", "dop853")
+_LOOKS = 8  # at the event indicators in a step of dop853
 
 
 def _as_nominal(values: FloatArray) -> FloatArray:
@@ -22,6 +22,11 @@ def _as_nominal(values: FloatArray) -> FloatArray:
     np.abs(values, out=values)
     values[values == 0.0] = 1.0
     return values
+
+
+def _changed(before: FloatArray, after: FloatArray) -> bool:
+    """Whether an indicator whose side is known is on the other one (FMI: > 0, or not)."""
+    return bool(((before != 0.0) & ((before > 0.0) != (after > 0.0))).any())
 
 
 class _NoInput:
@@ -45,10 +50,10 @@ class Integrator:
     tolerance : float
         Relative; the absolute one is this times the nominal value of each state.
 
-    Raises
-    ------
-    ConfigurationError
-        If the solver cannot treat the FMU.
+    Attributes
+    ----------
+    next_event : float or None
+        Time of the next event that the FMU asked for [s].
     """
 
     def __init__(
@@ -61,12 +66,7 @@ class Integrator:
         self._n = self._count("GetNumberOfContinuousStates", len(description.derivatives))
         n_indicators = description.numberOfEventIndicators or len(description.eventIndicators)
         self._n_indicators = self._count("GetNumberOfEventIndicators", n_indicators)
-        if solver == "dop853" and self._n_indicators:
-            raise ConfigurationError(
-                f"'{archive.path}' has {self._n_indicators} event indicators, which dop853 does "
-                'not watch\n  write solver = "cvode"'
-            )
-        self._events()  # it is in event mode since its initialization, and knows the time
+        self._events(t)  # it is in event mode since its initialization, and knows the time
         self._cvode: Any = None
         if solver == "cvode" and (self._n or self._n_indicators):
             self._cvode = self._make_cvode(t)
@@ -78,9 +78,9 @@ class Integrator:
         self._fmu.call(name, ct.byref(n))
         return int(n.value)
 
-    def _events(self) -> None:
+    def _events(self, t: float) -> None:
         """Handle events of the present time, in event mode already."""
-        _, self._next_event = self._fmu.discrete_update()
+        self.next_event = self._fmu.events_at(t)
         self._fmu.call("EnterContinuousTimeMode")
 
     def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
@@ -92,7 +92,7 @@ class Integrator:
         self._fmu.call("EnterEventMode")
         if change is not None:
             change()
-        self._events()
+        self._events(t)
         if not np.array_equal(before, self._moment()):
             self.restart(t)
 
@@ -121,8 +121,8 @@ class Integrator:
             If the FMU or the solver fails.
         """
         end = t + h
-        if self._next_event is not None and abs(self._next_event - end) <= 1e-9 * h:
-            end = self._next_event  # the same moment, added up in another way
+        if self.next_event is not None and abs(self.next_event - end) <= 1e-9 * h:
+            end = self.next_event  # the same moment, added up in another way
         if self._stale and self._cvode is not None:
             self._cvode.reset(t)
             self._stale = False
@@ -130,8 +130,8 @@ class Integrator:
         try:
             while t < end:
                 begun = t
-                due = self._next_event is not None and self._next_event <= end
-                stop = float(self._next_event) if due and self._next_event is not None else end
+                due = self.next_event is not None and self.next_event <= end
+                stop = float(self.next_event) if due and self.next_event is not None else end
                 stop = max(stop, t)
                 state_event = False
                 if stop > t:
@@ -153,25 +153,74 @@ class Integrator:
             self._fmu.set_time(t)
             return bool(event), stop if not event and math.isclose(t, stop, rel_tol=1e-14) else t
         if self._n:
-            from scipy.integrate import solve_ivp
+            return self._by_dop853(t, stop)
+        none = np.empty(0)
+        at = self._first_change(t, stop, lambda _: none, self._signs(t, none))
+        self._fmu.set_time(stop if at is None else at)
+        return (False, stop) if at is None else (True, at)
 
-            x = self._fmu.get_vector("GetContinuousStates", self._n)
-            nominal = _as_nominal(self._fmu.get_vector("GetNominalsOfContinuousStates", self._n))
-            found = solve_ivp(
-                self._rates, (t, stop), x, "DOP853",
-                rtol=max(self._tolerance, 3e-14), atol=self._tolerance * nominal,
-            )  # fmt: skip
-            if not found.success:
-                raise FmuError(f"the solver failed: {found.message}")
-            self._fmu.set_time(stop)
-            self._fmu.set_states(np.ascontiguousarray(found.y[:, -1]))
-        else:
-            self._fmu.set_time(stop)
+    def _by_dop853(self, t: float, stop: float) -> tuple[bool, float]:
+        """Integrate until an event at the latest; whether there is one, and when."""
+        from scipy.integrate import DOP853
+
+        x = self._fmu.get_vector("GetContinuousStates", self._n)
+        nominal = _as_nominal(self._fmu.get_vector("GetNominalsOfContinuousStates", self._n))
+        relative = max(self._tolerance, 3e-14)
+        solver = DOP853(self._rates, t, x, stop, rtol=relative, atol=self._tolerance * nominal)
+        signs = self._signs(t, x)
+        while solver.status == "running":
+            message = solver.step()
+            if solver.status == "failed":
+                raise FmuError(f"the solver failed: {message}")
+            if self._n_indicators:
+                path = solver.dense_output()
+                at = self._first_change(solver.t_old, solver.t, path, signs)
+                if at is not None:
+                    self._move(at, path(at))
+                    return True, at
+            self._move(solver.t, solver.y)
+            if solver.status == "running" and self._fmu.completed_step():
+                return True, float(solver.t)
         return False, stop
 
-    def _rates(self, t: float, x: FloatArray) -> FloatArray:
+    def _first_change(
+        self, start: float, end: float, path: Callable[[float], FloatArray], signs: FloatArray
+    ) -> float | None:
+        """First time, to the last bit, at which an indicator is on its other side (> 0, or not).
+
+        `signs` are those at `start`, and kept up to date. An indicator that is 0 there takes the
+        side to which it leaves.
+        """
+        if not self._n_indicators:
+            return None
+        before = start
+        for after in np.linspace(start, end, _LOOKS + 1)[1:].tolist():
+            found = self._signs(after, path(after))
+            if _changed(signs, found):
+                while before < (middle := 0.5 * (before + after)) < after:
+                    if _changed(signs, self._signs(middle, path(middle))):
+                        after = middle
+                    else:
+                        before = middle
+                return float(after)
+            before = after
+            signs[...] = np.where(signs == 0.0, found, signs)
+        return None
+
+    def _signs(self, t: float, x: FloatArray) -> FloatArray:
+        """Signs of the event indicators."""
+        if not self._n_indicators:
+            return np.empty(0)
+        self._move(t, x)
+        return np.sign(self._fmu.get_vector("GetEventIndicators", self._n_indicators))
+
+    def _move(self, t: float, x: FloatArray) -> None:
         self._fmu.set_time(t)
-        self._fmu.set_states(np.ascontiguousarray(x))
+        if self._n:
+            self._fmu.set_states(np.ascontiguousarray(x))
+
+    def _rates(self, t: float, x: FloatArray) -> FloatArray:
+        self._move(t, x)
         return self._fmu.rates(self._n).copy()
 
     def _make_cvode(self, t: float) -> Any:

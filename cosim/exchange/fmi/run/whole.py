@@ -22,11 +22,11 @@ MOST = 2**63 - 1
 
 
 def limits(kind: str, version: int) -> tuple[int, int]:
-    """Least and greatest number of a type of FMI 2 or 3."""
+    """Least and greatest number of a type of FMI."""
     if kind in BOOLEAN:
         return 0, 1
     if kind == "Enumeration":
-        kind = "Int32" if version == 2 else "Int64"
+        kind = "Int32" if version < 3 else "Int64"
     found = np.iinfo("int32" if kind == "Integer" else kind.lower())
     return int(found.min), int(found.max)
 

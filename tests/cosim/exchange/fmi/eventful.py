@@ -17,11 +17,17 @@ HEAD = """
 """
 
 
-def make_fmu(path, source, description, *, fmi, defines=""):
+def make_fmu(path, source, description, *, fmi, defines="", attributes=""):
     """Write an FMU of one C file; `description` is what stands in fmiModelDescription."""
     binary = build({"model.c": HEAD + defines + source}, ["model.c"], (None,))[host_platform()]
-    names = {2: 'fmiVersion="2.0" guid="t"', 3: 'fmiVersion="3.0" instantiationToken="t"'}
-    xml = f'<fmiModelDescription {names[fmi]} modelName="m">{description}</fmiModelDescription>'
+    names = {
+        1: 'fmiVersion="1.0" guid="t" modelIdentifier="m" numberOfContinuousStates="0" '
+        'numberOfEventIndicators="0"',
+        2: 'fmiVersion="2.0" guid="t"',
+        3: 'fmiVersion="3.0" instantiationToken="t"',
+    }
+    head = f'fmiModelDescription {names[fmi]} modelName="m" {attributes}'
+    xml = f"<{head}>{description}</fmiModelDescription>"
     host = host_platform()
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", xml)
@@ -288,6 +294,135 @@ def strict(path, *, n_states, ends=False, stuck=False):
     return make_fmu(path, STRICT, xml, fmi=2, defines=defines)
 
 
+# ------------------------------------------------------------------ a bouncing ball, FMI 2
+
+BALL = """
+struct m { double t, h, v, last, due; int bounces, ticks, entered, continuous; };
+struct info { int again, end, nominals, states, defined; double time; };
+static struct m *of(void *c) { return c; }
+F void *fmi2Instantiate(const char *a, int b, const char *c, const char *d, const void *e, int f,
+                        int g)
+{
+    struct m *i = calloc(1, sizeof *i);
+    i->h = 1.0, i->due = 0.25;
+    return i;
+}
+F void fmi2FreeInstance(void *c) { free(c); }
+F int fmi2SetupExperiment(void *c, int a, double b, double d, int e, double f) { return 0; }
+F int fmi2EnterInitializationMode(void *c) { return 0; }
+F int fmi2ExitInitializationMode(void *c) { return 0; }
+F int fmi2Terminate(void *c) { return 0; }
+F int fmi2EnterEventMode(void *c)
+{
+    if (!of(c)->continuous) return 3;
+    of(c)->continuous = 0, of(c)->entered++;
+    return 0;
+}
+F int fmi2EnterContinuousTimeMode(void *c) { of(c)->continuous = 1; return 0; }
+F int fmi2NewDiscreteStates(void *c, struct info *e)
+{
+    struct m *i = c;
+    memset(e, 0, sizeof *e);
+    if (STILL && !i->bounces && i->t >= 1.0 / 3.0) i->last = i->t, i->bounces++;
+    if (i->h <= 0.0 && i->v < 0.0) {
+        i->h = 0.0, i->v *= -0.7, i->last = i->t, i->bounces++;
+        e->states = 1;
+    }
+    if (i->t >= i->due) i->ticks++, i->due += 0.25;
+    e->defined = 1, e->time = i->due;
+    return 0;
+}
+F int fmi2CompletedIntegratorStep(void *c, int a, int *event, int *end)
+{
+    *event = *end = 0;
+    return 0;
+}
+F int fmi2SetTime(void *c, double t) { of(c)->t = t; return 0; }
+F int fmi2GetContinuousStates(void *c, double *x, size_t n)
+{
+    x[0] = of(c)->h, x[1] = of(c)->v;
+    return 0;
+}
+F int fmi2SetContinuousStates(void *c, const double *x, size_t n)
+{
+    of(c)->h = x[0], of(c)->v = x[1];
+    return of(c)->continuous ? 0 : 3;
+}
+F int fmi2GetDerivatives(void *c, double *x, size_t n)
+{
+    x[0] = of(c)->v, x[1] = -10.0;
+    return 0;
+}
+F int fmi2GetNominalsOfContinuousStates(void *c, double *x, size_t n)
+{
+    x[0] = x[1] = 1.0;
+    return 0;
+}
+F int fmi2GetEventIndicators(void *c, double *x, size_t n)
+{
+    x[0] = STILL ? 1.0 / 3.0 - of(c)->t : of(c)->h;
+    return 0;
+}
+F int fmi2SetReal(void *c, const uint32_t *vr, size_t n, const double *v) { return 3; }
+F int fmi2GetReal(void *c, const uint32_t *vr, size_t n, double *v)
+{
+    struct m *i = c;
+    double y[] = {i->h, i->v, i->last, i->bounces, i->ticks, i->entered};
+    for (size_t j = 0; j < n; j++) v[j] = y[vr[j]];
+    return 0;
+}
+F int fmi2GetFMUstate(void *c, void **s)
+{
+    if (!*s) *s = malloc(sizeof(struct m));
+    memcpy(*s, c, sizeof(struct m));
+    return 0;
+}
+F int fmi2SetFMUstate(void *c, void *s) { memcpy(c, s, sizeof(struct m)); return 0; }
+F int fmi2FreeFMUstate(void *c, void **s) { free(*s); *s = NULL; return 0; }
+F int fmi2SerializedFMUstateSize(void *c, void *s, size_t *n) { *n = sizeof(struct m); return 0; }
+F int fmi2SerializeFMUstate(void *c, void *s, char *b, size_t n) { memcpy(b, s, n); return 0; }
+F int fmi2DeSerializeFMUstate(void *c, const char *b, size_t n, void **s)
+{
+    *s = malloc(n);
+    memcpy(*s, b, n);
+    return 0;
+}
+"""
+
+BALL_XML = (
+    """
+<ModelExchange modelIdentifier="m" canGetAndSetFMUstate="true" canSerializeFMUstate="true"/>
+<ModelVariables>"""
+    + "".join(
+        f'<ScalarVariable name="{name}" valueReference="{k}" causality="output">'
+        "<Real/></ScalarVariable>"
+        for k, name in enumerate(["h", "v", "last", "bounces", "ticks", "entered"])
+    )
+    + """
+  <ScalarVariable name="der(h)" valueReference="1"><Real derivative="1"/></ScalarVariable>
+  <ScalarVariable name="der(v)" valueReference="7"><Real derivative="2"/></ScalarVariable>
+</ModelVariables>
+<ModelStructure><Outputs><Unknown index="1"/><Unknown index="2"/><Unknown index="3"/>
+<Unknown index="4"/><Unknown index="5"/><Unknown index="6"/></Outputs>
+<Derivatives><Unknown index="7"/><Unknown index="8"/></Derivatives></ModelStructure>
+"""
+)
+
+
+def ball(path, *, still=False):
+    """Write a ball that falls from 1 m (g = 10 m/s2) and keeps 0.7 of its speed when it bounces.
+
+    It also asks for a time event (ticks) every 0.25 s, and counts how often event mode is entered.
+    If it lies still, it has no continuous states, and its indicator is 1/3 s - t.
+    """
+    xml = BALL_XML
+    if still:
+        xml = xml.replace('<Unknown index="7"/><Unknown index="8"/>', "")
+        xml = xml.replace("<Derivatives></Derivatives>", "")
+    more, define = 'numberOfEventIndicators="1"', f"#define STILL {int(still)}\n"
+    return make_fmu(path, BALL, xml, fmi=2, attributes=more, defines=define)
+
+
 # ------------------------------------------------------------------ co-simulation that ends itself
 
 ENDING2 = """
@@ -475,3 +610,123 @@ STEPPING_XML = """
 def stepping(path):
     """Write a co-simulation that runs with event mode alone, and refuses what a mode forbids."""
     return make_fmu(path, STEPPING, STEPPING_XML, fmi=3)
+
+
+# ------------------------------------------------------------------ input clocks, FMI 3
+
+CLOCKED = """
+enum { START, INIT, EVENT, RUN };
+struct m { int mode, active, asked, period, late; double t, last_period, last_late; };
+static struct m *of(void *c) { return c; }
+F void *fmi3InstantiateCoSimulation(const char *a, const char *b, const char *c, bool d, bool e,
+    bool events, bool early, const uint32_t h[], size_t i, void *j, void *k, void *l)
+{
+    return events ? calloc(1, sizeof(struct m)) : NULL;
+}
+F void *fmi3InstantiateModelExchange(const char *a, const char *b, const char *c, bool d, bool e,
+                                     void *f, void *g)
+{
+    return calloc(1, sizeof(struct m));
+}
+F void fmi3FreeInstance(void *c) { free(c); }
+F int fmi3EnterInitializationMode(void *c, bool a, double b, double start, bool e, double f)
+{
+    of(c)->t = start;
+    return 0;
+}
+F int fmi3ExitInitializationMode(void *c) { of(c)->mode = EVENT; return 0; }
+F int fmi3Terminate(void *c) { return 0; }
+static int enter(struct m *i, int from, int to)
+{
+    if (i->mode != from) return 3;
+    i->mode = to;
+    return 0;
+}
+F int fmi3EnterEventMode(void *c) { return enter(c, RUN, EVENT); }
+F int fmi3EnterStepMode(void *c) { return enter(c, EVENT, RUN); }
+F int fmi3EnterContinuousTimeMode(void *c) { return enter(c, EVENT, RUN); }
+F int fmi3SetClock(void *c, const uint32_t *vr, size_t n, const bool *v)
+{
+    if (of(c)->mode != EVENT) return 3;
+    for (size_t j = 0; j < n; j++) of(c)->active |= v[j] ? 1 << vr[j] : 0;
+    return 0;
+}
+F int fmi3GetIntervalDecimal(void *c, const uint32_t *vr, size_t n, double *interval, int *qualifier)
+{
+    if (n != 1 || vr[0] != 2) return 3; /* of the constant clock, the description says it */
+    interval[0] = 0.05, qualifier[0] = of(c)->asked ? 2 : 1;
+    of(c)->asked = 0;
+    return 0;
+}
+F int fmi3UpdateDiscreteStates(void *c, bool *again, bool *end, bool *nominals, bool *states,
+                               bool *defined, double *next)
+{
+    struct m *i = c;
+    if (i->mode != EVENT) return 3;
+    *again = *end = *nominals = *states = *defined = false;
+    if (i->active & 1 << 1) i->period++, i->last_period = i->t, i->asked = i->period % 2;
+    if (i->active & 1 << 2) i->late++, i->last_late = i->t;
+    i->active = 0;
+    return 0;
+}
+F int fmi3DoStep(void *c, double t, double h, bool a, bool *event, bool *end, bool *early,
+                 double *last)
+{
+    *event = *end = *early = false;
+    *last = of(c)->t = t + h;
+    return of(c)->mode == RUN ? 0 : 3;
+}
+F int fmi3SetTime(void *c, double t) { of(c)->t = t; return 0; }
+F int fmi3CompletedIntegratorStep(void *c, bool a, bool *event, bool *end)
+{
+    *event = *end = false;
+    return 0;
+}
+F int fmi3GetNumberOfContinuousStates(void *c, size_t *n) { *n = 0; return 0; }
+F int fmi3GetNumberOfEventIndicators(void *c, size_t *n) { *n = 0; return 0; }
+F int fmi3GetFloat64(void *c, const uint32_t *vr, size_t n, double *v, size_t m)
+{
+    struct m *i = c;
+    v[0] = i->period, v[1] = i->last_period, v[2] = i->late, v[3] = i->last_late;
+    return 0;
+}
+F int fmi3GetFMUState(void *c, void **s)
+{
+    if (!*s) *s = malloc(sizeof(struct m));
+    memcpy(*s, c, sizeof(struct m));
+    return 0;
+}
+F int fmi3SetFMUState(void *c, void *s) { memcpy(c, s, sizeof(struct m)); return 0; }
+F int fmi3FreeFMUState(void *c, void **s) { free(*s); *s = NULL; return 0; }
+F int fmi3SerializedFMUStateSize(void *c, void *s, size_t *n) { *n = sizeof(struct m); return 0; }
+F int fmi3SerializeFMUState(void *c, void *s, uint8_t *b, size_t n) { memcpy(b, s, n); return 0; }
+F int fmi3DeserializeFMUState(void *c, const uint8_t *b, size_t n, void **s)
+{
+    *s = malloc(n);
+    memcpy(*s, b, n);
+    return 0;
+}
+"""
+
+CLOCKED_XML = """
+<ModelExchange modelIdentifier="m" canGetAndSetFMUState="true" canSerializeFMUState="true"/>
+<CoSimulation modelIdentifier="m" hasEventMode="true" canGetAndSetFMUState="true"
+  canSerializeFMUState="true"/>
+<ModelVariables>
+  <Clock name="period" valueReference="1" causality="input" intervalVariability="constant"
+    intervalCounter="3" shiftCounter="1" resolution="10"/>
+  <Clock name="late" valueReference="2" causality="input" intervalVariability="countdown"/>
+  <Clock name="outside" valueReference="3" causality="input" intervalVariability="triggered"/>
+  <Float64 name="y" valueReference="4" causality="output"><Dimension start="4"/></Float64>
+</ModelVariables>
+<ModelStructure><Output valueReference="4"/></ModelStructure>
+"""
+
+
+def clocked(path):
+    """Write a model with a clock of 0.3 s from 0.1 s on, and one that ticks 0.05 s after every other.
+
+    y = (ticks, time of the last) of both. A third clock is triggered. Clocks are set in event mode
+    alone.
+    """
+    return make_fmu(path, CLOCKED, CLOCKED_XML, fmi=3)

@@ -113,6 +113,6 @@ def foreign(
             _XML.format(guid=path.stem, identifier=identifier, flags=flags),
         )
         name = f"binaries/{platform.folder(2)}/{identifier}{platform.suffix}"
-        if identifier.isidentifier():
+        if not set(identifier) & set("/\\:"):
             out.writestr(name, library.read_bytes())
     return path

@@ -57,7 +57,14 @@ def test_without_a_description(tmp_path):
         open_archive(zipped(tmp_path / "x.fmu", inner__modelDescription_xml="<a/>"))
 
 
-@pytest.mark.parametrize(("version", "said"), [("1.0", "of FMI 1.0"), ("", "without a version")])
+@pytest.mark.parametrize(
+    ("version", "said"),
+    [
+        ("1.1", "of FMI 1.1; terrafix reads 1.0, 2.0 and 3.0"),
+        ("3.0-beta.3", "of FMI 3.0-beta.3, a draft of the standard; terrafix reads"),
+        ("", "without a version"),
+    ],
+)
 def test_other_versions(tmp_path, version, said):
     with pytest.raises(ConfigurationError, match=said):
         open_archive(zipped(tmp_path / "x.fmu", modelDescription_xml=XML.format(version)))

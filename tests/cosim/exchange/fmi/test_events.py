@@ -6,10 +6,11 @@ import eventful
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from fmu_helpers import broken
 
 from terrafix.cli import main
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import StepError
+from terrafix.cosim.basics.errors import ConfigurationError, StepError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.ports import Output
 from terrafix.cosim.engine.run import simulate
@@ -73,6 +74,72 @@ def test_an_fmu_that_asks_for_an_event_again_and_again(tmp_path):
         simulate(driven(file), duration="1")
 
 
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    return eventful.ball(tmp_path_factory.mktemp("balls") / "ball.fmu")
+
+
+def bouncing(file, **options):
+    with System("bouncing") as system:
+        system.add(Fmu(file=file, rate=Rate("0.1"), **options), "ball")
+        names = ("h", "v", "last", "bounces", "ticks", "entered")
+        system.record("history", [f"ball.{name}" for name in names])
+    return system
+
+
+@pytest.mark.parametrize(("solver", "error"), [("cvode", 1e-7), ("dop853", 1e-13)])
+def test_a_ball_bounces_when_it_should(ball, solver, error):
+    """It falls for t1 = sqrt(2 / g); the n-th bounce is 2 t1 (0.7 + ... + 0.7^(n - 1)) later.
+
+    Until 2 s there are four (0.447, 1.073, 1.512, 1.818 s), and eight time events.
+    """
+    found = simulate(bouncing(ball, solver=solver), duration="2").dataset
+    first = np.sqrt(0.2)
+    times = first * (1.0 + 2.0 * np.cumsum([0.0, *0.7 ** np.arange(1, 9)]))
+    t = np.arange(21) / 10
+    n = np.searchsorted(times, t)
+    since = t - np.where(n > 0, times[n - 1], 0.0)
+    speed = np.where(n > 0, 10.0 * first * 0.7**n, 0.0)
+    height = np.where(n > 0, 0.0, 1.0) + speed * since - 5.0 * since**2
+    assert found["ball.bounces"].values[:, 0].tolist() == n.tolist()
+    assert n[-1] == 4
+    last = np.where(n > 0, times[n - 1], 0.0)
+    assert found["ball.last"].values[:, 0] == pytest.approx(last, abs=error)
+    assert found["ball.h"].values[:, 0] == pytest.approx(height, abs=20 * error)
+    assert found["ball.ticks"].values[-1, 0] == 8
+
+
+@pytest.mark.parametrize("solver", ["cvode", "dop853"])
+def test_an_event_indicator_of_time_alone(tmp_path, solver):
+    """Without continuous states, it passes 0 at 1/3 s; event mode is entered there, and every 0.25 s."""
+    file = eventful.ball(tmp_path / "still.fmu", still=True)
+    found = simulate(bouncing(file, solver=solver), duration="0.6").dataset
+    assert found["ball.last"].values[-1, 0] == pytest.approx(1 / 3, abs=1e-12)
+    assert found["ball.bounces"].values[:, 0].tolist() == [0, 0, 0, 0, 1, 1, 1]
+    assert found["ball.entered"].values[-1, 0] == 3
+
+
+@pytest.mark.parametrize(("solver", "error"), [("cvode", 1e-7), ("dop853", 0.0)])
+def test_a_restored_model_goes_on_without_an_event_of_its_own(ball, tmp_path, solver, error):
+    """The time of its next event is restored with its state: event mode is entered as often.
+
+    CVode begins anew where it is restored; DOP853 does so in each step.
+    """
+    whole = Simulation(bouncing(ball, solver=solver))
+    whole.run_until("1.1")
+    write_checkpoint(tmp_path / "run.ckpt", whole.get_state())
+    other = Simulation(bouncing(ball, solver=solver))
+    other.set_state(read_checkpoint(tmp_path / "run.ckpt"))
+    for simulation in (whole, other):
+        simulation.run_until("2")
+    found = [s.get_state() for s in (whole, other)]
+    outputs = [s["master"]["components"]["ball"]["extra"]["outputs"] for s in found]
+    assert outputs[1][0, 3:].tolist() == outputs[0][0, 3:].tolist() == [4, 8, 12]
+    assert outputs[1][0] == pytest.approx(outputs[0][0], rel=0.0, abs=error)
+    for simulation in (whole, other):
+        simulation.master.terminate()
+
+
 # ------------------------------------------------------------------ co-simulation with FMI 3
 
 
@@ -95,8 +162,55 @@ def test_clocks_that_never_tick_are_told(tmp_path):
     file = eventful.make_fmu(tmp_path / "clock.fmu", eventful.STEPPING, xml, fmi=3)
     assert (
         driven(file).check().notes[1]
-        == "'part': its clocks c never tick: terrafix drives no clocks"
+        == "'part': its clocks c never tick: nothing here triggers them"
     )
+
+
+@pytest.mark.parametrize("kind", ["co-simulation", "model exchange"])
+def test_clocks_that_depend_on_time_tick(tmp_path, kind):
+    """Those of 0.3 s: at 0.1, 0.4, 0.7, ... 1.9 s; the countdown after the first, third, ... of them.
+
+    So at 0.15, 0.75, 1.35 and 1.95 s. A checkpoint at 0.6 s changes nothing.
+    """
+    file = eventful.clocked(tmp_path / "clocked.fmu")
+    with System("clocked") as system:
+        system.add(Fmu(file=file, rate=Rate("0.2"), kind=kind), "part")
+        system.record("history", ["part.y"])
+    assert (
+        "'part': its clocks outside never tick: nothing here triggers them" in system.check().notes
+    )
+    y = simulate(system, duration="2").dataset["part.y"].values[:, 0]
+    assert y[:, 0].tolist() == [0, 1, 2, 2, 3, 4, 4, 5, 6, 6, 7]
+    assert y[:, 2].tolist() == [0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4]
+    assert y[-1, [1, 3]] == pytest.approx([1.9, 1.95], abs=1e-12)
+    first = Simulation(system)
+    first.run_until("0.6")
+    state = first.get_state()
+    first.master.terminate()
+    second = Simulation(system)
+    second.set_state(state)
+    second.run_until("2")
+    after = second.get_state()["master"]["components"]["part"]["extra"]["outputs"]
+    second.master.terminate()
+    assert after[0].tolist() == y[-1].tolist()
+
+
+def test_inputs_of_clocks_are_told(tmp_path):
+    file = eventful.clocked(tmp_path / "clocked.fmu")
+    more = '<Float64 name="u" valueReference="9" causality="input" clocks="1" start="0"/>'
+    xml = [("</ModelVariables>", f"{more}</ModelVariables>")]
+    part = Fmu(file=broken(file, tmp_path / "more.fmu", xml=xml), rate=Rate("0.2"))
+    part.prepare()
+    assert (
+        part.capabilities.notes[-1] == "its inputs u are set when they change, not by their clocks"
+    )
+
+
+def test_a_clock_without_a_sensible_interval_is_refused(tmp_path):
+    file = eventful.clocked(tmp_path / "clocked.fmu")
+    wrong = broken(file, tmp_path / "wrong.fmu", xml=[('"3" shift', '"0" shift')])
+    with pytest.raises(ConfigurationError, match=r"the interval of its clock 'period' is '0 / 10'"):
+        Fmu(file=wrong, rate=Rate("0.2")).prepare()
 
 
 # ------------------------------------------------------------------ an FMU that ends its simulation

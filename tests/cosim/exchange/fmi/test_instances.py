@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from foreign import foreign
+from small_fmus import Variable, small_fmu
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import StepError
+from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.ports import Output
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.exchange.fmi.check.check import check_fmu
 from terrafix.cosim.exchange.fmi.run.component import Fmu
@@ -176,3 +179,48 @@ def test_a_loop_of_fmus_that_can_be_instantiated_once(tmp_path):
     assert y == pytest.approx([0.9**-5] * 2, rel=1e-10)
     assert "once in a process" in result.notes[0]
     assert np.isfinite(y).all()
+
+
+def test_a_binary_that_cannot_be_loaded_says_why_in_processes_of_their_own(tmp_path):
+    """It wants a function that nobody has; the process of a member ended without a word."""
+    file = foreign(
+        tmp_path / "x.fmu",
+        globals_="extern int nobody_has_this; int *here = &nobody_has_this;",
+        flags=ONCE,
+    )
+    with pytest.raises(StepError, match=r"x.fmu' cannot be loaded: .*nobody_has_this"):
+        flown(part(file), members=2)
+
+
+class One(Component):
+    """The number 1."""
+
+    default_rate = Rate("0.1")
+
+    n = Output((), unit="1", dtype=np.int64)
+
+    def _initialize_impl(self):
+        self.port_views["n"][...] = 1
+
+    def _step_impl(self, t, dt):
+        pass
+
+
+def test_static_data_of_an_fmu_that_refuses_an_input_without_start_value(tmp_path):
+    """Its input is 1 by itself and must not be 0, which is no value that anybody gave it."""
+    file = small_fmu(
+        tmp_path / "x.fmu",
+        2,
+        [Variable("y"), Variable("n", "Integer", "input")],
+        enter="if (!m->n[1]) m->n[1] = 1;",
+        step="if (!m->n[1]) return 3; count += 1; m->r[0] = count;",
+        globals_=COUNTER,
+    )
+    with System("s") as system:
+        system.add(One(), "one")
+        system.add(part(file), "a")
+        system.connect("one.n", "a.n")
+    system.record("r", ["a.y"])
+    result = simulate(system, members=2, duration="0.5")
+    assert "disturb each other" in result.notes[0]
+    assert result.dataset["a.y"].values[-1].tolist() == [5, 5]
