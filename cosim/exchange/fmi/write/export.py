@@ -84,6 +84,7 @@ def export_fmu(
     platforms: str = "host",
     start: Starts | None = None,
     name: str | None = None,
+    scalars: bool = False,
 ) -> Exported:
     """Export a component, or a whole system, as an FMU.
 
@@ -104,6 +105,9 @@ def export_fmu(
         of a system, instead of what it reads there at t = 0.
     name : str, optional
         Name of the model.
+    scalars : bool
+        Whether arrays of FMI 3 become scalars, named as in FMI 2 (``r_e[1]``): not every tool
+        reads arrays.
 
     Raises
     ------
@@ -115,6 +119,11 @@ def export_fmu(
     target = writable_target(path, (".fmu",))
     if fmi not in (2, 3):
         raise ConfigurationError(f"there is no FMI {fmi}\n  write 2 or 3")
+    if scalars and fmi == 2:
+        raise ConfigurationError(
+            "scalars do nothing with FMI 2, which has no arrays\n"
+            "  leave scalars out, or write FMI 3"
+        )
     chosen = chosen_platforms(platforms)
     source = source_of(what, component, start)
     if name is not None:
@@ -123,7 +132,7 @@ def export_fmu(
                 f"'{name}' cannot name a model: use letters, digits and underscores, a letter first"
             )
         source.name = name
-    layout = laid_out(source, fmi)
+    layout = laid_out(source, fmi, scalars=scalars)
     texts, token = sources(layout, fmi)
     files = compiled(texts)
     texts |= headers(fmi)
@@ -186,7 +195,7 @@ def write_archive(target: Path, content: Mapping[str, bytes]) -> None:
             archive.writestr(info, data)
 
 
-def laid_out(source: Source, version: int) -> Layout:
+def laid_out(source: Source, version: int, *, scalars: bool = False) -> Layout:
     """Lay an export out, and refuse what the standard or the model cannot do.
 
     Raises
@@ -194,7 +203,7 @@ def laid_out(source: Source, version: int) -> Layout:
     ConfigurationError
         If a seed is too large, or the start is not finite with the given start values.
     """
-    layout = Layout(source)
+    layout = Layout(source, scalars=scalars)
     limit = 2**31 if version == 2 else 2**63
     for variable in layout.integers:
         if variable.start is not None and not 0 <= variable.start < limit:
