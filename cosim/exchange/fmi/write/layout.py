@@ -554,6 +554,7 @@ class Layout:
                 for key, each in port.fields.items():
                     factors[key] = tuple(float(f) for f in flat[at : at + each.size])
                     at += each.size
+        # from within, nothing is held at the start
         late = port.at == "start" and source is not None
         lists = latch if late else convert
         keys = [*port.fields, *(["t"] if port.kind == "message" else [])]
@@ -570,7 +571,8 @@ class Layout:
             if not late and not factors.get(key):
                 places[label] = origin
                 continue
-            places[label] = self._keep(size)
+            start = self.start_real[origin : origin + size] if source == where else np.nan
+            places[label] = self._keep(size, start if late else 0.0)
             lists.append(Copy(origin, places[label], size, factors.get(key, ())))
         if port.kind != "message":
             return

@@ -19,7 +19,7 @@ from fmu_helpers import OPEN_LOOP, without_evaluation
 
 import terrafix as tf
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
+from terrafix.cosim.basics.errors import ConfigurationError, StepError, SystemCheckError
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.exchange.fmi.check.checks import Subject
@@ -208,6 +208,62 @@ def test_the_two_meanings_of_an_input_read_at_the_end(spring, fmi):
     assert sampled(fmi, spring, ahead=1) == pytest.approx(np.array(expected), rel=1e-13, abs=1e-14)
     late = sampled(fmi, spring, ahead=0)
     assert np.abs(late - np.array(expected)).max() == pytest.approx(h / 1.5, rel=0.05)
+
+
+def dependencies(unknowns):
+    return {u.variable.name: [v.name for v in u.dependencies] for u in unknowns}
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_a_start_follows_from_an_input_read_at_the_start(tmp_path, fmi):
+    """u = (5, 1) is set in initialization mode: y is 3 u, then 3 u + 0.1 u. With its start value
+    2 it is 6, as natively."""
+    file = tmp_path / "follower.fmu"
+    export_fmu(fmu_parts.Follower(), file, fmi=fmi)
+    start = {"u": "5 1"} if fmi == 3 else {"u[1]": 5.0, "u[2]": 1.0}
+    for values, expected in (
+        ({}, [[6.0, 6.0], [6.2, 6.2]]),
+        (start, [[15.0, 3.0], [15.5, 3.1]]),
+    ):
+        rows = fmpy.simulate_fmu(str(file), stop_time=0.1, output_interval=0.1, start_values=values)
+        found = rows["y"] if fmi == 3 else np.stack([rows["y[1]"], rows["y[2]"]], axis=1)
+        assert found == pytest.approx(np.array(expected), abs=1e-15)
+    found = dependencies(fmpy.read_model_description(str(file)).initialUnknowns)
+    assert found == ({"y": ["u"]} if fmi == 3 else {"y[1]": ["u[1]"], "y[2]": ["u[2]"]})
+    assert not tf.check_fmu(file).findings
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_model_exchange_takes_an_input_read_at_the_start(tmp_path, fmi):
+    """x = 3 u + u t with u = 5, and der(x) = 5 in any mode; derivatives by u are 1."""
+    file = tmp_path / "pushed.fmu"
+    export_fmu(fmu_parts.Pushed(), file, fmi=fmi)
+    t = np.array([0.0, 0.1, 0.2])
+    for kind in ("CoSimulation", "ModelExchange"):
+        rows = fmpy.simulate_fmu(str(file), stop_time=0.2, output_interval=0.1, fmi_type=kind,
+                                 solver="CVode", start_values={"u": 5.0})  # fmt: skip
+        assert rows["x"] == pytest.approx(15 + 5 * t, rel=1e-12)
+        assert rows["sum"] == pytest.approx(20 + 5 * t, rel=1e-12)
+    description = fmpy.read_model_description(str(file))
+    assert dependencies(description.derivatives) == {"der(x)": ["u"]}
+    assert not tf.check_fmu(file).findings  # derivatives against differences among them
+
+
+def test_within_a_system_nothing_is_held_at_the_start(tmp_path):
+    """A start that follows from another's output through such a link: refused, as natively."""
+    with System("pair", duration="0.1") as system:
+        source = system.add(fmu_parts.Turning(), "a")
+        follower = system.add(fmu_parts.Pushed(), "b")
+        system.connect(source["x"], follower["u"])
+        system.expose("sum", follower["sum"])
+    with pytest.raises(StepError, match=r"'b': .*nothing was published at t = 0 for u"):
+        simulate(system)
+    export_fmu(system, tmp_path / "pair.fmu")
+    subject = Subject(open_archive(tmp_path / "pair.fmu"), CO_SIMULATION)
+    instance = subject.initializing()
+    with pytest.raises(FmuError, match=r"'b': '.*' is not finite at t = 0 s, nor is"):
+        instance.finish()
+    instance.free()
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
