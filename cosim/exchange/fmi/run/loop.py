@@ -63,9 +63,8 @@ class FmuLoop(Telling):
             for own, (_, setting) in fmu.own_settings().items():
                 name = f"{part}_{own}"
                 if name in settings or name in ATTRIBUTES | KEYS or hasattr(FmuLoop, name):
-                    other = (
-                        "'{1}' of FMU '{0}'".format(*owner[name]) if name in owner else "another"
-                    )
+                    before, first = owner.get(name, ("", ""))
+                    other = f"'{first}' of FMU '{before}'" if before else "another"
                     raise ConfigurationError(
                         f"'{self.name}': parameter '{own}' of FMU '{part}' would be called "
                         f"'{name}', as {other} is\n  give the FMU another name in files"
