@@ -57,7 +57,7 @@ class FmuLoop(Telling):
                 self._parts[name].name = name
             self._files = dict(files)
         settings: dict[str, Setting[object]] = {}
-        owner = {}
+        owner: dict[str, tuple[str, str]] = {}
         for part, fmu in self._parts.items():
             fmu.declare_settings()
             for own, (_, setting) in fmu.own_settings().items():
