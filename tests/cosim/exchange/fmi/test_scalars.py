@@ -107,7 +107,7 @@ def test_nothing_is_found_wrong(scalars, name):
     assert validate_fmu(str(scalars(name))) == []
     report = check_fmu(scalars(name))
     assert [*report.findings, *report.warnings] == []
-    assert len(report.checks) == 11
+    assert {"description", "library", "start", "state", "derivatives"} <= set(report.checks)
 
 
 def described(field):
