@@ -212,6 +212,7 @@ def laid_out(source: Source, version: int, *, scalars: bool = False) -> Layout:
                 f"{32 if version == 2 else 64} bits\n  choose a smaller one"
             )
     _refuse_unfinished_start(layout)
+    _refuse_unheld_start(layout)
     return layout
 
 
@@ -235,6 +236,35 @@ def _refuse_unfinished_start(layout: Layout) -> None:
         '  export it as a component of a system, which gives them, or pass start={"'
         f'{inputs[0] if inputs else "port"}": {{"": [...]}}}}'
     )
+
+
+def _refuse_unheld_start(layout: Layout) -> None:
+    """Evaluate the start of a system, some of whose inputs hold nothing then."""
+    real = np.asarray(layout.start_real)
+    for part in layout.parts:
+        for copy in part.convert:
+            if not copy.integer:
+                source = real[copy.source : copy.source + copy.size]
+                real[copy.target : copy.target + copy.size] = source * (copy.factor or 1.0)
+        function = part.initial.function
+        places = part.initial.arguments
+        arguments = [real[a : a + function.numel_in(i)] for i, a in enumerate(places)]
+        results = [np.ravel(np.asarray(r)) for r in function.call(arguments)]
+        for target, result in zip(part.targets, results, strict=True):
+            real[target.offset : target.offset + target.size] = result
+        if all(np.isfinite(r).all() for r in results):
+            continue
+        inputs = part.component.model.inputs
+        held = dict(zip(inputs, arguments, strict=False))
+        for name in (n for n, values in held.items() if np.isnan(values).any()):
+            path = f"{part.name}.{name.partition('.')[0]}"
+            connections = (c for c in layout.source.connections if c.target == path)
+            link = next((f"'{c}'" for c in connections), f"'{path}'")
+            raise ConfigurationError(
+                f"'{layout.source.name}' does not start: '{part.name}' finds its start from "
+                f"{link}, which is read at the start of a step, and holds nothing at t = 0\n"
+                "  expose that input instead, or find the start from parameters"
+            )
 
 
 # --------------------------------------------------------------------------------- sources

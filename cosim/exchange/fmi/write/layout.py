@@ -422,6 +422,8 @@ class Layout:
         components = list(self.source.components.items())
         if len(components) != 1 or not components[0][1].model.derivatives:
             return
+        if self.source.connections:  # of its outputs with its inputs, held from step to step
+            return
         import casadi as ca
 
         _, component = components[0]

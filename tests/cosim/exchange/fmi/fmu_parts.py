@@ -78,6 +78,26 @@ class Pushed(SymbolicComponent):
         )
 
 
+class Own(SymbolicComponent):
+    """x' = u from 1 on."""
+
+    default_rate = Rate("0.1")
+    u = Input((), unit="1", at="start", doc="derivative")
+    x = Output((), unit="1", doc="state")
+
+    def build_model(self):
+        x, u = ca.SX.sym("x"), ca.SX.sym("u")
+        return Model(
+            "own",
+            inputs={"u": u},
+            states={"x": x},
+            initial={"x": ca.SX(1)},
+            derivatives={"x": u},
+            outputs={"x": x},
+            step=ca.SX.sym("dt"),
+        )
+
+
 class Turning(SymbolicComponent):
     """x' = cos t: a derivative that depends on time alone."""
 

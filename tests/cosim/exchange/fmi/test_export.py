@@ -259,12 +259,22 @@ def test_within_a_system_nothing_is_held_at_the_start(tmp_path):
         system.expose("sum", follower["sum"])
     with pytest.raises(StepError, match=r"'b': .*nothing was published at t = 0 for u"):
         simulate(system)
-    export_fmu(system, tmp_path / "pair.fmu")
-    subject = Subject(open_archive(tmp_path / "pair.fmu"), CO_SIMULATION)
-    instance = subject.initializing()
-    with pytest.raises(FmuError, match=r"'b': '.*' is not finite at t = 0 s, nor is"):
-        instance.finish()
-    instance.free()
+    message = r"'pair' does not start: 'b' finds its start from 'a.x -> b.u', which is read at the"
+    with pytest.raises(ConfigurationError, match=message):
+        export_fmu(system, tmp_path / "pair.fmu")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_held_for_its_own_input_is_for_co_simulation(tmp_path):
+    """x' = u from 1 on, u the x of the last step: 1.1 times as much after each 0.1 s."""
+    with System("own") as system:
+        body = system.add(fmu_parts.Own(), "body")
+        system.connect(body["x"], body["u"])
+        system.expose("x", body["x"])
+    made = export_fmu(system, tmp_path / "own.fmu")
+    assert made.kinds == ("co-simulation",)
+    rows = fmpy.simulate_fmu(str(tmp_path / "own.fmu"), stop_time=0.3, output_interval=0.1)
+    assert rows["x"] == pytest.approx(1.1 ** np.arange(4), rel=1e-14)
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
