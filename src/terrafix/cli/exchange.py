@@ -24,10 +24,21 @@ MOST_SHOWN = 6
     default="host",
     help="Whose binaries it carries; all but the host's own need zig.",
 )
+@click.option(
+    "--scalars",
+    is_flag=True,
+    help="Arrays of FMI 3 become scalars, r[1], r[2], ...: for tools that read no arrays.",
+)
 @set_option
 @json_option
 def export_fmu_command(
-    what: str, out: str, fmi: str, platforms: str, settings: Settings, as_json: bool
+    what: str,
+    out: str,
+    fmi: str,
+    platforms: str,
+    scalars: bool,
+    settings: Settings,
+    as_json: bool,
 ) -> None:
     """Export a component, or a whole symbolic system, as an FMU."""
     from terrafix.cosim.exchange.fmi.write.export import export_fmu
@@ -35,7 +46,9 @@ def export_fmu_command(
     writable_target(out, (".fmu",))
     path, component = _named(what)
     loaded = read(path, settings, outside=True)
-    made = export_fmu(loaded, out, component=component, fmi=int(fmi), platforms=platforms)
+    made = export_fmu(
+        loaded, out, component=component, fmi=int(fmi), platforms=platforms, scalars=scalars
+    )
     if as_json:
         print_json(made.summary())
         return

@@ -12,16 +12,16 @@ from terrafix.cosim.files.readers import read_system
 
 @pytest.fixture(scope="session")
 def exported(tmp_path_factory):
-    """Export a component of the open loop: ``exported("orbit", 3)``."""
+    """Export a component of the open loop: ``exported("orbit", 3)``; ``scalars`` with FMI 3."""
     folder = tmp_path_factory.mktemp("fmus")
     made: dict = {}
 
-    def get(component, fmi, settings=()):
-        key = (component, fmi, tuple(settings))
+    def get(component, fmi, settings=(), scalars=False):
+        key = (component, fmi, tuple(settings), scalars)
         if key not in made:
             system = read_system(OPEN_LOOP, settings)
             file = folder / f"{component}_{len(made)}_{fmi}.fmu"
-            export_fmu(system, file, component=component, fmi=fmi)
+            export_fmu(system, file, component=component, fmi=fmi, scalars=scalars)
             made[key] = file
         return made[key]
 

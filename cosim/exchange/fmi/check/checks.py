@@ -553,7 +553,8 @@ def _reached(
         before = subject.get(instance, outputs)
         for v in knowns:
             now = subject.get(instance, [v])
-            value = now + 1e-3 * np.where(now == 0, 1.0, np.abs(now))
+            with np.errstate(over="ignore"):  # of the largest number, which stands for infinity
+                value = now + 1e-3 * np.where(now == 0, 1.0, np.abs(now))
             value = np.clip(value, *v.bounds)
             try:
                 subject.set(instance, v, value)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import UNDEFINED
-from terrafix.cosim.declare.component import ATTRIBUTES, KEYS
+from terrafix.cosim.declare.component import ATTRIBUTES, KEYS, Environment
 from terrafix.cosim.declare.parameters import (
     Choice,
     FilePath,
@@ -119,6 +119,8 @@ class Fmu(Telling):
 
     def declare_settings(self) -> None:
         """Declare the parameters of the FMU."""
+        if "file" not in self.given_parameters:
+            return
         archive = open_archive(self.given_parameters["file"])
         sizes = self._sizes()
         kind, arrays = self.given_parameters["kind"], self.given_parameters["arrays"]
@@ -393,6 +395,10 @@ class Fmu(Telling):
             if port.is_input or (q.initial in ("exact", "approx") and q.variability != "constant")
         }
 
+    def own_settings(self) -> dict[str, tuple[Quantity, Setting[object]]]:
+        """Parameters of the FMU by the names they have here, and how they are declared."""
+        return {n: (self._quantities[n], s) for n, s in self._found_settings.items()}
+
     def given_starts(self) -> dict[str, NDArray[Any]]:
         """Numbers that were set, by the FMU's names, in the units of the variables."""
         found = dict(self._given)
@@ -415,11 +421,7 @@ class Fmu(Telling):
         """Refuse an FMU whose step does not fit its rate."""
         if self._interface is None:
             return  # its file was refused, and that was said
-        for name in self._found_settings.keys() & self.__dict__.keys():
-            raise ConfigurationError(
-                f"'{self.name}.{name}' was assigned as an attribute, which sets nothing\n"
-                f'  write set_parameter("{name}", ...)'
-            )
+        self.refuse_attributes()
         interface = self.interface
         step = getattr(interface.archive.description.coSimulation, "fixedInternalStepSize", None)
         tick = float(step or 0.0)
@@ -503,7 +505,7 @@ class Fmu(Telling):
             env.path,
             inputs,
             outputs,
-            (*self._start_settings(), *self._identities()),
+            (*self._start_settings(), *identities(interface, env, self._given)),
             self.given_parameters["solver"],
             self.tolerance_of_solver(),
             interface.event_mode,
@@ -535,7 +537,7 @@ class Fmu(Telling):
         found = [
             start_values(name, self._quantities[name], setting, self.parameter_values[name])
             for name, setting in self._found_settings.items()
-            if name in self.given_parameters or self._is_dispersed(name, setting)
+            if self.is_handed_on(name, setting)
         ]
         known = self.settable()
         for name, value in self._given.items():  # outputs, and numbers that no double holds
@@ -545,25 +547,6 @@ class Fmu(Telling):
                 rows = value.reshape(1, -1)
                 found.append(Start(name, q.kind, tuple(q.references), rows, structural))
         return [*found, *self._texts]
-
-    def _is_dispersed(self, name: str, setting: Setting[object]) -> bool:
-        if not isinstance(setting, Parameter) or name not in self.parameter_values:
-            return False
-        return bool(np.any(self.parameter_values[name] != setting.default))
-
-    def _identities(self) -> list[Start]:
-        """Seed and member of an FMU of terrafix: its noise is that of the native component."""
-        if not self.interface.own:
-            return []
-        env = self.environment
-        values = {"seed": np.full(env.n_members, env.seed), "member": env.members}
-        found = []
-        for name, numbers in values.items():
-            q = self.interface.parameters.get(name)
-            if q is not None and name not in self._given:
-                rows = np.asarray(numbers).reshape(-1, 1)
-                found.append(Start(name, q.kind, tuple(q.references), rows))
-        return found
 
     def _view(self, port: str, name: str) -> NDArray[Any]:
         view = self.port_views[port]
@@ -716,6 +699,20 @@ class Fmu(Telling):
         for name, numbers in saved["sequence"].items():
             self._sequence[name][...] = numbers
         self._t, self._first = float(saved["t"]), bool(saved["first"])
+
+
+def identities(interface: Interface, env: Environment, given: Collection[str] = ()) -> list[Start]:
+    """Seed and member of an FMU of terrafix: its noise is that of the native component."""
+    if not interface.own:
+        return []
+    values = {"seed": np.full(env.n_members, env.seed), "member": env.members}
+    found = []
+    for name, numbers in values.items():
+        q = interface.parameters.get(name)
+        if q is not None and name not in given:
+            rows = np.asarray(numbers).reshape(-1, 1)
+            found.append(Start(name, q.kind, tuple(q.references), rows))
+    return found
 
 
 def usual_step(rate: Rate | None) -> float:

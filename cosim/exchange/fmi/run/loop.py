@@ -16,11 +16,13 @@ import numpy as np
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, WiringError, nearest
-from terrafix.cosim.declare.parameters import Count, FileTable, Parameter, Text
+from terrafix.cosim.declare.component import ATTRIBUTES, KEYS
+from terrafix.cosim.declare.parameters import Count, FileTable, Parameter, Setting, Text
 from terrafix.cosim.declare.ports import Capabilities, Input, Output, Port
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION
-from terrafix.cosim.exchange.fmi.run.component import Fmu, grouped, usual_step
+from terrafix.cosim.exchange.fmi.run.component import Fmu, grouped, identities, usual_step
 from terrafix.cosim.exchange.fmi.run.fleet import Setup
+from terrafix.cosim.exchange.fmi.run.parameters import Size, Start, start_values
 from terrafix.cosim.exchange.fmi.run.places import AnyFleet, make_fleet
 from terrafix.cosim.exchange.fmi.run.telling import Telling
 from terrafix.cosim.system.wiring import check_connection, port_factor
@@ -32,7 +34,7 @@ class FmuLoop(Telling):
     """Several FMUs for co-simulation, iterated in every step until their signals agree.
 
     Outputs are called ``a_y`` for output y of FMU a; inputs that are not connected within
-    likewise. The FMUs must be able to get and set their state.
+    likewise, and parameters. The FMUs must be able to get and set their state.
     """
 
     files = FileTable(doc="the .fmu files by name")
@@ -41,12 +43,56 @@ class FmuLoop(Telling):
     most_iterations = Count(100, minimum=1, doc="steps repeated at most so often")
 
     _begun = False
+    _files: dict[str, Any] | None = None
+    _parts: dict[str, Fmu]
+    _owner: dict[str, tuple[str, str]]
+
+    def declare_settings(self) -> None:
+        """Declare the parameters of the FMUs: ``a_k`` for parameter k of FMU a."""
+        files = self.given_parameters.get("files", {})
+        if self._files != files:
+            self._parts = {}
+            for name, file in files.items():
+                self._parts[name] = Fmu(file=file, kind=CO_SIMULATION)
+                self._parts[name].name = name
+            self._files = dict(files)
+        settings: dict[str, Setting[object]] = {}
+        owner: dict[str, tuple[str, str]] = {}
+        for part, fmu in self._parts.items():
+            fmu.declare_settings()
+            for own, (_, setting) in fmu.own_settings().items():
+                name = f"{part}_{own}"
+                if name in settings or name in ATTRIBUTES | KEYS or hasattr(FmuLoop, name):
+                    before, first = owner.get(name, ("", ""))
+                    other = f"'{first}' of FMU '{before}'" if before else "another"
+                    raise ConfigurationError(
+                        f"'{self.name}': parameter '{own}' of FMU '{part}' would be called "
+                        f"'{name}', as {other} is\n  give the FMU another name in files"
+                    )
+                settings[name], owner[name] = setting, (part, own)
+        for name in self._found_settings.keys() - settings.keys():
+            if name in self.given_parameters:
+                raise ConfigurationError(
+                    f"'{self.name}.{name}' was set, but its FMUs have no such parameter\n"
+                    f"  {nearest(name, settings, what='they have')}"
+                )
+        self._found_settings, self._owner = settings, owner
+
+    def set_parameter(self, name: str, value: object, *, bare: bool = True) -> None:
+        """Set a parameter by name, of the component or of its FMUs."""
+        if name not in self.settings() and not self.missing_settings():
+            self.declare_settings()
+        super().set_parameter(name, value, bare=bare)
+        if isinstance(self._found_settings.get(name), Size):  # arrays have another size
+            part, own = self._owner[name]
+            self._parts[part].set_parameter(own, value)
+            self.declare_settings()
 
     def prepare(self) -> None:
-        """Read the files, and declare the ports that are not connected within."""
-        self._parts = {
-            name: self._part(name, file) for name, file in self.given_parameters["files"].items()
-        }
+        """Read the files, and declare parameters, and the ports that are not connected within."""
+        self.declare_settings()
+        for name, part in self._parts.items():
+            self._prepare_part(name, part)
         self._links = [
             self._link(text) for text in self.given_parameters["connect"].split(",") if text.strip()
         ]
@@ -74,9 +120,7 @@ class FmuLoop(Telling):
         made.name = name
         self.ports[name] = made
 
-    def _part(self, name: str, file: Any) -> Fmu:
-        part = Fmu(file=file, kind=CO_SIMULATION)
-        part.name = name
+    def _prepare_part(self, name: str, part: Fmu) -> None:
         part.prepare()
         if not part.interface.state:
             raise ConfigurationError(
@@ -88,7 +132,10 @@ class FmuLoop(Telling):
                 raise ConfigurationError(
                     f"'{self.name}': port '{key}' of '{name}' is no plain signal of real numbers"
                 )
-        return part
+
+    def validate(self) -> None:
+        """Refuse parameters that were assigned as attributes."""
+        self.refuse_attributes()
 
     def _link(self, text: str) -> tuple[str, str, str, str]:
         match = _CONNECTION.match(text)
@@ -166,6 +213,7 @@ class FmuLoop(Telling):
                 f"{env.path}.{name}",
                 inputs,
                 outputs,
+                (*self._starts(name), *identities(part.interface, env)),
                 tolerance=part.tolerance_of_solver(),
             )
             starts = np.zeros((env.n_members, sum(g.size for g in inputs)))
@@ -176,6 +224,16 @@ class FmuLoop(Telling):
             self.remarks += [remark] if remark else []
             fleet.inputs[...] = starts
         self._t, self._logged = 0.0, 0
+
+    def _starts(self, part: str) -> list[Start]:
+        """Parameters of one FMU that were set, or that members have values of their own of."""
+        own = self._parts[part].own_settings()
+        return [
+            start_values(name, own[key][0], setting, self.parameter_values[name])
+            for name, setting in self._found_settings.items()
+            for owner, key in (self._owner[name],)
+            if owner == part and self.is_handed_on(name, setting)
+        ]
 
     def _outside(self, *, finite: bool = False, known: Collection[str] | None = None) -> None:
         """Take the inputs that come from outside, or those that are known of them."""

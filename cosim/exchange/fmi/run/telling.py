@@ -6,6 +6,8 @@ import logging
 
 import numpy as np
 
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.parameters import Parameter, Setting
 from terrafix.cosim.declare.settling import Settling
 from terrafix.cosim.exchange.fmi.run.binding import STATUS
 from terrafix.cosim.exchange.fmi.run.fleet import Ended, Failures
@@ -21,6 +23,22 @@ class Telling(Settling):
 
     _t = 0.0
     _logged = 0
+
+    def refuse_attributes(self) -> None:
+        """Refuse parameters of FMUs that were assigned as attributes."""
+        for name in self._found_settings.keys() & self.__dict__.keys():
+            raise ConfigurationError(
+                f"'{self.name}.{name}' was assigned as an attribute, which sets nothing\n"
+                f'  write set_parameter("{name}", ...)'
+            )
+
+    def is_handed_on(self, name: str, setting: Setting[object]) -> bool:
+        """Whether a parameter was set, or members have values of their own of it."""
+        if name in self.given_parameters:
+            return True
+        if not isinstance(setting, Parameter) or name not in self.parameter_values:
+            return False
+        return bool(np.any(self.parameter_values[name] != setting.default))
 
     def _tell(self, fleet: AnyFleet, failures: Failures, part: str = "") -> None:
         """Show what a fleet logged, and report failures; `part` names one FMU of several."""

@@ -246,6 +246,20 @@ static void copy_all(struct instance *i, const struct copy *copy, int32_t n)
                    copy->size * sizeof(double));
 }
 
+/*
+ * What a part reads at the start of a step and is set outside, as it stands now: in `real`, or of
+ * tangents. So it is when the start is found, and at any time in model exchange.
+ */
+static void take_inputs(const struct part *part, double *numbers)
+{
+    for (int32_t k = 0; k < part->n_latch; k++) {
+        const struct copy *copy = &part->latch[k];
+        if (!copy->integer && copy->from < n_variable_reals
+            && real_variable[owner_of_real[copy->from]].causality == INPUT)
+            memcpy(numbers + copy->to, numbers + copy->from, copy->size * sizeof(double));
+    }
+}
+
 /* Refuse to start without a message that is needed. */
 static enum status refuse_missing(struct instance *i, const struct part *part)
 {
@@ -329,6 +343,7 @@ static enum status evaluate_start(struct instance *i)
         for (int32_t k = 0; k < part->n_stream; k++)
             now->key[part->stream[k].key] = stream_key(now->integer[SEED], &part->stream[k]);
         copy_all(i, part->convert, part->n_convert);
+        take_inputs(part, now->real);
         receive(i, part, part->starts_at_zero);
         draw_noise(i, p);
         if (refuse_missing(i, part))
@@ -434,6 +449,8 @@ enum status finish_initialization(struct instance *i, int model_exchange)
 /* Outputs and derivatives at the present time and states. */
 static enum status evaluate_rates(struct instance *i, int outputs)
 {
+    if (i->now.mode != STEPPING)
+        take_inputs(&parts[0], i->now.real);
     if (evaluate(i, &continuous.rate, continuous.target, continuous.n_target, parts[0].name))
         return ERROR;
     const double *next = i->next;
@@ -526,6 +543,7 @@ enum status update_discrete(struct instance *i, int *defined, double *next_time)
         now->real[part->step_length] = TICKS_TO_SECONDS(following_tick - now->event_tick);
         memcpy(now->real + part->before, now->real + part->state,
                part->n_state * sizeof(double));
+        take_inputs(part, now->real);
         if (evaluate(i, &part->step, part->target, part->n_target, part->name))
             return ERROR;
         const double *next = i->next;
@@ -673,6 +691,7 @@ static enum status tangents_of_parts(struct instance *i)
                 i->tangent[copy->to + j] = i->tangent[copy->from + j]
                                            * (copy->factor ? copy->factor[j] : 1);
         }
+        take_inputs(part, i->tangent);
         if (evaluate(i, starting ? &part->initial_forward : &part->step_forward, part->target,
                      part->n_output, part->name))
             return ERROR;
@@ -685,6 +704,7 @@ enum status propagate_tangent(struct instance *i)
 {
     if (!in_model_exchange(i))
         return tangents_of_parts(i);
+    take_inputs(&parts[0], i->tangent);
     if (evaluate(i, &continuous.rate_forward, continuous.target, continuous.n_target,
                  parts[0].name))
         return ERROR;

@@ -60,7 +60,7 @@ class Dependencies:
         exact = inputs + [
             v for v in [*self.layout.reals, *self.layout.integers] if v.causality == "parameter"
         ]
-        started = self._spread(exact, lambda part: part.initial)
+        started = self._spread(exact, lambda part: part.initial, starting=True)
         states = self.layout.continuous.states if self.layout.continuous else []
         rates = self.layout.continuous.derivatives if self.layout.continuous else []
         if self.layout.continuous is None:
@@ -71,6 +71,7 @@ class Dependencies:
             stepped = self._seeded(known)
             for variable in states:
                 self._seed(stepped, variable, known, at=variable.state)
+            self._take_inputs(stepped, self.layout.parts[0])
             self._through(stepped, self.layout.continuous.rate, self.layout.continuous.targets)
             self._through(started, self.layout.continuous.rate, self.layout.continuous.targets)
         self.outputs = [self._unknown(v, stepped, known) for v in outputs]
@@ -101,8 +102,18 @@ class Dependencies:
         for k in range(variable.size):
             reach[at + k, column + k] = True
 
-    def _spread(self, known: Sequence[Variable], choose: Any) -> BoolArray:
-        """Reach of `known` through all parts in their order."""
+    def _take_inputs(self, reach: BoolArray, part: Part) -> None:
+        """Reach of inputs that are read at the start of a step, and are set outside."""
+        inputs = {v.offset for v in self.layout.reals if v.causality == "input"}
+        for copy in part.latch:
+            if not copy.integer and copy.source in inputs:
+                source = reach[copy.source : copy.source + copy.size]
+                reach[copy.target : copy.target + copy.size] = source
+
+    def _spread(
+        self, known: Sequence[Variable], choose: Any, *, starting: bool = False
+    ) -> BoolArray:
+        """Reach of `known` through all parts in their order, when the start is found or later."""
         reach = self._seeded(known)
         n_real = len(self.layout.start_real)
         noise = [n_real + p for p in (self.layout.seed, self.layout.member) if p >= 0]
@@ -111,6 +122,8 @@ class Dependencies:
                 if not copy.integer:
                     source = reach[copy.source : copy.source + copy.size]
                     reach[copy.target : copy.target + copy.size] = source
+            if starting:
+                self._take_inputs(reach, part)
             for message in part.received:
                 if message.fresh >= 0:
                     reach[message.fresh] = reach[n_real + message.sequence]

@@ -164,7 +164,7 @@ class _Writer:
                     field.set("frame", variable.frame)
                 if not isinstance(variable.unit, str):
                     field.set("units", "|".join(variable.unit))
-        for variable in self.layout.reals:
+        for variable in self.layout.arrays:
             if variable.causality == "parameter":
                 made = ET.SubElement(element, "Parameter", {"variable": variable.name})
                 if variable.frame:
@@ -201,11 +201,13 @@ class _Writer:
 
 
 class _Fmi3(_Writer):
+    def __init__(self, layout: Layout) -> None:
+        super().__init__(layout)
+        self._row = {id(v): row for row, v in enumerate(self.variables)}
+
     def value_reference(self, variable: Variable) -> int:
         """Row in the tables of variables: all real ones, then the integers."""
-        if variable.kind == "real":
-            return self.layout.reals.index(variable)
-        return len(self.layout.reals) + self.layout.integers.index(variable)
+        return self._row[id(variable)]
 
     def units_of(self, variable: Variable) -> Iterable[str]:
         return [variable.common_unit or ""]

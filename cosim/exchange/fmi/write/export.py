@@ -84,6 +84,7 @@ def export_fmu(
     platforms: str = "host",
     start: Starts | None = None,
     name: str | None = None,
+    scalars: bool = False,
 ) -> Exported:
     """Export a component, or a whole system, as an FMU.
 
@@ -104,6 +105,9 @@ def export_fmu(
         of a system, instead of what it reads there at t = 0.
     name : str, optional
         Name of the model.
+    scalars : bool
+        Whether arrays of FMI 3 become scalars, named as in FMI 2 (``r_e[1]``): not every tool
+        reads arrays.
 
     Raises
     ------
@@ -115,6 +119,11 @@ def export_fmu(
     target = writable_target(path, (".fmu",))
     if fmi not in (2, 3):
         raise ConfigurationError(f"there is no FMI {fmi}\n  write 2 or 3")
+    if scalars and fmi == 2:
+        raise ConfigurationError(
+            "scalars do nothing with FMI 2, which has no arrays\n"
+            "  leave scalars out, or write FMI 3"
+        )
     chosen = chosen_platforms(platforms)
     source = source_of(what, component, start)
     if name is not None:
@@ -123,7 +132,7 @@ def export_fmu(
                 f"'{name}' cannot name a model: use letters, digits and underscores, a letter first"
             )
         source.name = name
-    layout = laid_out(source, fmi)
+    layout = laid_out(source, fmi, scalars=scalars)
     texts, token = sources(layout, fmi)
     files = compiled(texts)
     texts |= headers(fmi)
@@ -186,7 +195,7 @@ def write_archive(target: Path, content: Mapping[str, bytes]) -> None:
             archive.writestr(info, data)
 
 
-def laid_out(source: Source, version: int) -> Layout:
+def laid_out(source: Source, version: int, *, scalars: bool = False) -> Layout:
     """Lay an export out, and refuse what the standard or the model cannot do.
 
     Raises
@@ -194,7 +203,7 @@ def laid_out(source: Source, version: int) -> Layout:
     ConfigurationError
         If a seed is too large, or the start is not finite with the given start values.
     """
-    layout = Layout(source)
+    layout = Layout(source, scalars=scalars)
     limit = 2**31 if version == 2 else 2**63
     for variable in layout.integers:
         if variable.start is not None and not 0 <= variable.start < limit:
@@ -203,6 +212,7 @@ def laid_out(source: Source, version: int) -> Layout:
                 f"{32 if version == 2 else 64} bits\n  choose a smaller one"
             )
     _refuse_unfinished_start(layout)
+    _refuse_unheld_start(layout)
     return layout
 
 
@@ -226,6 +236,35 @@ def _refuse_unfinished_start(layout: Layout) -> None:
         '  export it as a component of a system, which gives them, or pass start={"'
         f'{inputs[0] if inputs else "port"}": {{"": [...]}}}}'
     )
+
+
+def _refuse_unheld_start(layout: Layout) -> None:
+    """Evaluate the start of a system, some of whose inputs hold nothing then."""
+    real = np.asarray(layout.start_real)
+    for part in layout.parts:
+        for copy in part.convert:
+            if not copy.integer:
+                source = real[copy.source : copy.source + copy.size]
+                real[copy.target : copy.target + copy.size] = source * (copy.factor or 1.0)
+        function = part.initial.function
+        places = part.initial.arguments
+        arguments = [real[a : a + function.numel_in(i)] for i, a in enumerate(places)]
+        results = [np.ravel(np.asarray(r)) for r in function.call(arguments)]
+        for target, result in zip(part.targets, results, strict=True):
+            real[target.offset : target.offset + target.size] = result
+        if all(np.isfinite(r).all() for r in results):
+            continue
+        inputs = part.component.model.inputs
+        held = dict(zip(inputs, arguments, strict=False))
+        for name in (n for n, values in held.items() if np.isnan(values).any()):
+            path = f"{part.name}.{name.partition('.')[0]}"
+            connections = (c for c in layout.source.connections if c.target == path)
+            link = next((f"'{c}'" for c in connections), f"'{path}'")
+            raise ConfigurationError(
+                f"'{layout.source.name}' does not start: '{part.name}' finds its start from "
+                f"{link}, which is read at the start of a step, and holds nothing at t = 0\n"
+                "  expose that input instead, or find the start from parameters"
+            )
 
 
 # --------------------------------------------------------------------------------- sources

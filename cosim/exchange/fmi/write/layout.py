@@ -199,12 +199,21 @@ class Source:
 class Layout:
     """Places, variables, parts and dependencies of an exported FMU.
 
+    Parameters
+    ----------
+    source : Source
+    scalars : bool
+        Declare the elements of arrays as variables, and no arrays.
+
     Attributes
     ----------
     source : Source
     reals, integers : list of Variable
         Declared variables, in the order of their places.
+    arrays : list of Variable
+        The reals, before arrays become scalars.
     ports : list of PortVariables
+        Of arrays, also where scalars are declared.
     parts : list of Part
     continuous : Continuous or None
     start_real : list of float
@@ -214,7 +223,7 @@ class Layout:
         Places of these two.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, *, scalars: bool = False) -> None:
         self.source = source
         self.reals: list[Variable] = []
         self.integers: list[Variable] = []
@@ -237,6 +246,9 @@ class Layout:
         self.parts = [self._part(path) for path in source.components]
         self.continuous = self._continuous()
         self._nominals()
+        self.arrays = self.reals
+        if scalars:
+            self._declare_elements()
 
     # ------------------------------------------------------------------ allocation
 
@@ -410,6 +422,8 @@ class Layout:
         components = list(self.source.components.items())
         if len(components) != 1 or not components[0][1].model.derivatives:
             return
+        if self.source.connections:  # of its outputs with its inputs, held from step to step
+            return
         import casadi as ca
 
         _, component = components[0]
@@ -542,6 +556,7 @@ class Layout:
                 for key, each in port.fields.items():
                     factors[key] = tuple(float(f) for f in flat[at : at + each.size])
                     at += each.size
+        # from within, nothing is held at the start
         late = port.at == "start" and source is not None
         lists = latch if late else convert
         keys = [*port.fields, *(["t"] if port.kind == "message" else [])]
@@ -558,7 +573,8 @@ class Layout:
             if not late and not factors.get(key):
                 places[label] = origin
                 continue
-            places[label] = self._keep(size)
+            start = self.start_real[origin : origin + size] if source == where else np.nan
+            places[label] = self._keep(size, start if late else 0.0)
             lists.append(Copy(origin, places[label], size, factors.get(key, ())))
         if port.kind != "message":
             return
@@ -662,6 +678,18 @@ class Layout:
             assert variable.state is not None
             size = float(np.max(np.abs(at[variable.state]), initial=0.0))
             variable.nominal = size if np.isfinite(size) and size > 0 else 1.0
+
+    def _declare_elements(self) -> None:
+        """Put the elements of arrays in their places, among the continuous states too."""
+        elements = {v: v.elements() for v in self.arrays}
+        self.reals = [e for each in elements.values() for e in each]
+        for variable, each in elements.items():
+            if variable.derivative_of is not None:
+                for element, state in zip(each, elements[variable.derivative_of], strict=True):
+                    element.derivative_of = state
+        if (continuous := self.continuous) is not None:
+            continuous.states = [e for v in continuous.states for e in elements[v]]
+            continuous.derivatives = [e for v in continuous.derivatives for e in elements[v]]
 
 
 def _size(model: Any, name: str) -> int:

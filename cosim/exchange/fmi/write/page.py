@@ -26,7 +26,7 @@ _TITLES = {
 def page(layout: Layout) -> str:
     """Write documentation/index.html: one page, without anything from outside."""
     source = layout.source
-    variables = [*layout.reals, *layout.integers]
+    variables = [*layout.arrays, *layout.integers]
     rows = {
         title: [_row(v) for v in variables if v.causality == causality]
         for causality, title in _TITLES.items()

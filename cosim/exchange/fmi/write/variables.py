@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,16 @@ class Variable:
             f"{inner}[{','.join(str(i + 1) for i in index)}]" for index in np.ndindex(self.shape)
         ]
         return [f"der({name})" for name in names] if self.is_derivative else names
+
+    def elements(self) -> list[Variable]:
+        """Its scalars as variables of their own, but for what a derivative is derived from."""
+        starts = [None] * self.size if self.start is None else self.starts()
+        states = [None if self.state is None else self.state + k for k in range(self.size)]
+        pairs = zip(self.element_names(), self.units(), starts, states, strict=True)
+        return [
+            replace(self, name=n, unit=u, start=s, state=x, shape=(), offset=self.offset + k)
+            for k, (n, u, s, x) in enumerate(pairs)
+        ]
 
     def starts(self) -> list[float]:
         """Start values of its scalars."""

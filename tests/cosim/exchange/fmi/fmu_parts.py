@@ -37,6 +37,67 @@ class EulerIntegrator(SymbolicComponent):
         )
 
 
+class Follower(SymbolicComponent):
+    """A state that starts from three times its input, and then moves by it, in steps."""
+
+    default_rate = Rate("0.1")
+    u = Input((2,), unit="1", at="start", default=2.0, doc="followed")
+    y = Output((2,), unit="1", doc="state")
+
+    def build_model(self):
+        x, u, dt = ca.SX.sym("x", 2), ca.SX.sym("u", 2), ca.SX.sym("dt")
+        return Model(
+            "follower",
+            inputs={"u": u},
+            states={"x": x},
+            initial={"x": 3 * u},
+            next={"x": x + dt * u},
+            outputs={"y": x},
+            step=dt,
+        )
+
+
+class Pushed(SymbolicComponent):
+    """x' = u, which is read at the start of a step; x starts from 3 u."""
+
+    default_rate = Rate("0.1")
+    u = Input((), unit="1", at="start", default=2.0, doc="derivative")
+    x = Output((), unit="1", doc="state")
+    sum = Output((), unit="1", doc="state plus derivative")
+
+    def build_model(self):
+        x, u = ca.SX.sym("x"), ca.SX.sym("u")
+        return Model(
+            "pushed",
+            inputs={"u": u},
+            states={"x": x},
+            initial={"x": 3 * u},
+            derivatives={"x": u},
+            outputs={"x": x, "sum": x + u},
+            step=ca.SX.sym("dt"),
+        )
+
+
+class Own(SymbolicComponent):
+    """x' = u from 1 on."""
+
+    default_rate = Rate("0.1")
+    u = Input((), unit="1", at="start", doc="derivative")
+    x = Output((), unit="1", doc="state")
+
+    def build_model(self):
+        x, u = ca.SX.sym("x"), ca.SX.sym("u")
+        return Model(
+            "own",
+            inputs={"u": u},
+            states={"x": x},
+            initial={"x": ca.SX(1)},
+            derivatives={"x": u},
+            outputs={"x": x},
+            step=ca.SX.sym("dt"),
+        )
+
+
 class Turning(SymbolicComponent):
     """x' = cos t: a derivative that depends on time alone."""
 

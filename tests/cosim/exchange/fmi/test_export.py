@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import casadi as ca
 import fmpy
@@ -19,7 +20,7 @@ from fmu_helpers import OPEN_LOOP, without_evaluation
 
 import terrafix as tf
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
+from terrafix.cosim.basics.errors import ConfigurationError, StepError, SystemCheckError
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.exchange.fmi.check.checks import Subject
@@ -208,6 +209,72 @@ def test_the_two_meanings_of_an_input_read_at_the_end(spring, fmi):
     assert sampled(fmi, spring, ahead=1) == pytest.approx(np.array(expected), rel=1e-13, abs=1e-14)
     late = sampled(fmi, spring, ahead=0)
     assert np.abs(late - np.array(expected)).max() == pytest.approx(h / 1.5, rel=0.05)
+
+
+def dependencies(unknowns):
+    return {u.variable.name: [v.name for v in u.dependencies] for u in unknowns}
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_a_start_follows_from_an_input_read_at_the_start(tmp_path, fmi):
+    """u = (5, 1) is set in initialization mode: y is 3 u, then 3 u + 0.1 u. With its start value
+    2 it is 6, as natively."""
+    file = tmp_path / "follower.fmu"
+    export_fmu(fmu_parts.Follower(), file, fmi=fmi)
+    start = {"u": "5 1"} if fmi == 3 else {"u[1]": 5.0, "u[2]": 1.0}
+    for values, expected in (
+        ({}, [[6.0, 6.0], [6.2, 6.2]]),
+        (start, [[15.0, 3.0], [15.5, 3.1]]),
+    ):
+        rows = fmpy.simulate_fmu(str(file), stop_time=0.1, output_interval=0.1, start_values=values)
+        found = rows["y"] if fmi == 3 else np.stack([rows["y[1]"], rows["y[2]"]], axis=1)
+        assert found == pytest.approx(np.array(expected), abs=1e-15)
+    found = dependencies(fmpy.read_model_description(str(file)).initialUnknowns)
+    assert found == ({"y": ["u"]} if fmi == 3 else {"y[1]": ["u[1]"], "y[2]": ["u[2]"]})
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_model_exchange_takes_an_input_read_at_the_start(tmp_path, fmi):
+    """x = 3 u + u t with u = 5, and der(x) = 5 in any mode; derivatives by u are 1."""
+    file = tmp_path / "pushed.fmu"
+    export_fmu(fmu_parts.Pushed(), file, fmi=fmi)
+    t = np.array([0.0, 0.1, 0.2])
+    for kind in ("CoSimulation", "ModelExchange"):
+        rows = fmpy.simulate_fmu(str(file), stop_time=0.2, output_interval=0.1, fmi_type=kind,
+                                 solver="CVode", start_values={"u": 5.0})  # fmt: skip
+        assert rows["x"] == pytest.approx(15 + 5 * t, rel=1e-12)
+        assert rows["sum"] == pytest.approx(20 + 5 * t, rel=1e-12)
+    description = fmpy.read_model_description(str(file))
+    assert dependencies(description.derivatives) == {"der(x)": ["u"]}
+    if fmi == 2:  # derivatives against differences among them
+        assert not tf.check_fmu(file).findings
+
+
+def test_within_a_system_nothing_is_held_at_the_start(tmp_path):
+    """A start that follows from another's output through such a link: refused, as natively."""
+    with System("pair", duration="0.1") as system:
+        source = system.add(fmu_parts.Turning(), "a")
+        follower = system.add(fmu_parts.Pushed(), "b")
+        system.connect(source["x"], follower["u"])
+        system.expose("sum", follower["sum"])
+    with pytest.raises(StepError, match=r"'b': .*nothing was published at t = 0 for u"):
+        simulate(system)
+    message = r"'pair' does not start: 'b' finds its start from 'a.x -> b.u', which is read at the"
+    with pytest.raises(ConfigurationError, match=message):
+        export_fmu(system, tmp_path / "pair.fmu")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_held_for_its_own_input_is_for_co_simulation(tmp_path):
+    """x' = u from 1 on, u the x of the last step: 1.1 times as much after each 0.1 s."""
+    with System("own") as system:
+        body = system.add(fmu_parts.Own(), "body")
+        system.connect(body["x"], body["u"])
+        system.expose("x", body["x"])
+    made = export_fmu(system, tmp_path / "own.fmu")
+    assert made.kinds == ("co-simulation",)
+    rows = fmpy.simulate_fmu(str(tmp_path / "own.fmu"), stop_time=0.3, output_interval=0.1)
+    assert rows["x"] == pytest.approx(1.1 ** np.arange(4), rel=1e-14)
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
@@ -464,32 +531,44 @@ def test_the_noise_key_is_that_of_python(tmp_path):
 # ------------------------------------------------------------------ for other tools
 
 
-def from_sources(file, target):
-    """An FMU with the binary that a compiler makes of its sources, told nothing of visibility."""
-    folder = target.parent / f"{target.stem}_sources"
+def unpacked(file, folder):
+    """An FMU's folder without its binary, and the path of that."""
     with zipfile.ZipFile(file) as archive:
         archive.extractall(folder)
-    (configuration,) = read_build_description(str(folder))
-    (sources,) = configuration.sourceFileSets
-    command = [*working_compiler().command, "-shared", "-fPIC", *sources.sourceFiles]
-    (binary,) = (folder / "binaries").glob("*/*.so")
-    subprocess.run([*command, "-o", str(binary), "-lm"], cwd=folder / "sources", check=True)
-    with zipfile.ZipFile(target, "w") as archive:
-        for path in folder.rglob("*"):
-            archive.write(path, path.relative_to(folder))
-    return target
+    (binary,) = (folder / "binaries").glob("*/*")
+    binary.unlink()
+    return folder, binary
+
+
+def listed(folder, fmi):
+    """The sources that a tool is told to compile: FMI 2 names them for each kind."""
+    if fmi == 3:
+        (configuration,) = read_build_description(str(folder))
+        (sources,) = configuration.sourceFileSets
+        return sources.sourceFiles
+    root = ElementTree.parse(folder / "modelDescription.xml").getroot()
+    kinds = [k for k in root if k.tag in ("CoSimulation", "ModelExchange")]
+    (names,) = {tuple(f.get("name") for f in k.iterfind("SourceFiles/File")) for k in kinds}
+    return list(names)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="compiles for Linux")
 @pytest.mark.parametrize("fmi", VERSIONS)
-def test_compiled_from_its_sources(spring, tmp_path, fmi):
-    """The C library's `advance` is not called; in FMPy, the same bytes as of our binary."""
-    options = {"stop_time": 0.5, "output_interval": 0.01, "fmi_type": "CoSimulation"}
+def test_compiled_from_its_sources(exported, tmp_path, fmi):
+    """By a compiler told nothing of visibility; in FMPy, the same bytes as of our binary.
+
+    The C library's `advance` is not called.
+    """
+    folder, binary = unpacked(exported("orbit", fmi), tmp_path)
+    names = listed(folder, fmi)
+    assert {"core.c", "model.c", f"fmi{fmi}.c"} <= set(names)
+    command = [*working_compiler().command, "-shared", "-fPIC", "-I.", *names]
+    subprocess.run([*command, "-o", str(binary), "-lm"], cwd=folder / "sources", check=True)
+    options = {"stop_time": 0.1, "output_interval": 0.01, "fmi_type": "CoSimulation"}
     found, expected = (
-        fmpy.simulate_fmu(str(file), **options)
-        for file in (from_sources(spring(fmi), tmp_path / "compiled.fmu"), spring(fmi))
+        fmpy.simulate_fmu(str(file), **options) for file in (folder, exported("orbit", fmi))
     )
-    assert len(expected) == 51
+    assert len(expected) == 11
     assert found.tobytes() == expected.tobytes()
 
 
@@ -535,6 +614,13 @@ def test_infinity_is_the_largest_number(tmp_path, fmi):
     (found,) = subject.get(instance, [subject.by_name["whole"]])
     assert found == sys.float_info.max == subject.by_name["whole"].start[0]
     instance.free()
+
+
+def test_check_fmu_says_nothing_of_infinity(tmp_path, capfd):
+    export_fmu(fmu_parts.Share(), tmp_path / "share.fmu", scalars=True)
+    report = tf.check_fmu(tmp_path / "share.fmu")
+    assert [*report.findings, *report.warnings] == []
+    assert capfd.readouterr().err == ""
 
 
 def outputs_of(fmu):

@@ -14,6 +14,8 @@ from terrafix.cosim.campaign.campaign import run_campaign
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.exchange.fmi.run.component import Fmu
+from terrafix.cosim.exchange.fmi.run.loop import FmuLoop
+from terrafix.cosim.exchange.fmi.write.export import export_fmu
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.files.writing import write_system
 from terrafix.cosim.system.dispersion import Dispersion
@@ -240,3 +242,90 @@ def test_start_values_still_set_parameters(spring):
     found = [output(alone(made), "part.x").tobytes() for made in (by_start, by_name, native)]
     assert len(set(found)) == 1
     assert float(by_start.setting("mass")) == 3.0
+
+
+def test_a_parameter_without_the_file_that_has_it():
+    for kind, name in ((Fmu, "file"), (FmuLoop, "files")):
+        with pytest.raises(ConfigurationError, match=f"has no parameter 'k'\n.*{name}"):
+            kind(k=3)
+
+
+# ------------------------------------------------------------------ of FMUs that loop
+
+
+@pytest.fixture(scope="module")
+def integrator(tmp_path_factory):
+    """x' = u + drive, y = x + shift."""
+    file = tmp_path_factory.mktemp("integrator") / "integrator.fmu"
+    export_fmu(fmu_parts.EulerIntegrator(), file)
+    return file
+
+
+def test_a_loop_takes_the_parameters_of_its_fmus(integrator, tmp_path):
+    """y = u by the implicit Euler method: (y + drive) grows by 1 / (1 - h) in each step."""
+    text = (
+        'schema = "terrafix-system/1"\nname = "s"\n[component.part]\ntype = "fmu_loop"\n'
+        f'rate = "100 Hz"\na_drive = 2.0\nfiles = {{ a = "{integrator}" }}\n'
+        'connect = "a.y -> a.u"\n'
+    )
+    (tmp_path / "s.toml").write_text(text)
+    system = read_system(tmp_path / "s.toml", [("part.a_shift", "5")])
+    expected = [(5 + 2) / 0.99**10 - 2]
+    assert output(system, "part.a_y")[:, 0] == pytest.approx(expected, rel=1e-10)
+    write_system(system, tmp_path / "again.toml")
+    assert output(read_system(tmp_path / "again.toml"), "part.a_y")[:, 0] == pytest.approx(expected)
+    system = read_system(tmp_path / "s.toml")
+    system.disperse(Dispersion("shift", ("part.a_shift",), ["1", "2", "4"], kind="list"))
+    found = output(system, "part.a_y", members=3)[:, 0]
+    expected = (np.array([1, 2, 4]) + 2) / 0.99**10 - 2
+    assert found == pytest.approx(expected, rel=1e-10)
+
+
+STATE = """
+F int fmi2GetFMUstate(void *c, void **s)
+{ if (!*s) *s = malloc(sizeof(struct m)); memcpy(*s, c, sizeof(struct m)); return 0; }
+F int fmi2SetFMUstate(void *c, void *s) { memcpy(c, s, sizeof(struct m)); return 0; }
+F int fmi2FreeFMUstate(void *c, void **s) { free(*s); *s = 0; return 0; }
+"""
+
+
+def test_parameters_of_every_type_reach_the_fmus_of_a_loop(tmp_path):
+    """With units and bounds, one for each FMU."""
+    flag = 'modelIdentifier="m" canGetAndSetFMUstate="true"'
+    xml = eventful.SETTINGS_XML.replace('modelIdentifier="m"', flag)
+    file = eventful.make_fmu(tmp_path / "m.fmu", eventful.SETTINGS + STATE, xml, fmi=2)
+    given = {"p_body_k": "3000 g", "p_mode": "fast", "p_tolerance_": 5, "p_on": True, "q_word": "x"}
+    loop = FmuLoop(files={"p": file, "q": file}, connect="", rate=Rate("0.1"), **given)
+    system = alone(loop)
+    assert output(system, "part.p_y").tolist() == [[3.0, 5.0, 9.0, 1.0, ord("s")]]
+    assert output(system, "part.q_y").tolist() == [[2.0, 3.0, 7.0, 0.0, ord("x")]]
+    body = loop.settings()["q_body_k"]
+    assert (body.kind(), body.doc, float(body.default)) == ("number [kg]", "mass of the body", 2.0)
+    for name, value, message in (
+        ("p_body_k", "0.5 kg", r"'part.p_body_k' is 0.5 kg; it must be at least 1 kg"),
+        ("p_bodyk", 3, "has no parameter 'p_bodyk'\n  did you mean 'p_body_k'?"),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            loop.set_parameter(name, value)
+    loop.p_mode = "slow"
+    with pytest.raises(SystemCheckError, match=r"'part.p_mode' was assigned as an attribute"):
+        output(system, "part.p_y")
+    files = {"p": file, "most": eventful_named(tmp_path, "iterations", xml)}
+    with pytest.raises(ConfigurationError, match="'most' would be called 'most_iterations', as an"):
+        alone(FmuLoop(files=files, connect="", rate=Rate("0.1")))
+
+
+def eventful_named(tmp_path, name, xml):
+    """The same with its text called something else."""
+    changed = xml.replace('name="word"', f'name="{name}"')
+    return eventful.make_fmu(tmp_path / "n.fmu", eventful.SETTINGS + STATE, changed, fmi=2)
+
+
+def test_members_of_a_loop_have_their_own_noise(exported):
+    """That of the same FMU as a component: its seed and member are those of the run."""
+    file, rate = exported("imu", 3), Rate("0.01")
+    alone_ = output(alone(Fmu(file=file, rate=rate), "part"), "part.delta_v_b", members=2)
+    loop = FmuLoop(files={"i": file}, connect="", rate=rate)
+    found = output(alone(loop), "part.i_delta_v_b", members=2)
+    assert np.array_equal(found, alone_)
+    assert (found[0] != found[1]).all()
