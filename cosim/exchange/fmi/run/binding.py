@@ -253,6 +253,11 @@ def references(values: Sequence[int]) -> Any:
     return (ct.c_uint32 * len(values))(*values)
 
 
+def c_type(version: int, kind: str) -> tuple[str, Any]:
+    """How functions name the type of a variable, and what C has for it."""
+    return _TYPES[f"{kind}2" if version == 2 and f"{kind}2" in _TYPES else kind]
+
+
 class Instance:
     """One instance of an FMU.
 
@@ -378,14 +383,9 @@ class Instance:
 
     # ------------------------------------------------------------------ variables
 
-    def _type(self, kind: str) -> tuple[str, Any]:
-        if self._version == 2 and f"{kind}2" in _TYPES:
-            kind = f"{kind}2"
-        return _TYPES[kind]
-
     def get(self, kind: str, vr: Any, n: int) -> NDArray[Any]:
         """Values of variables of one type, `n` numbers in all."""
-        name, ctype = self._type(kind)
+        name, ctype = c_type(self._version, kind)
         values = (ctype * max(n, 1))()
         sizes = () if self._version == 2 else (ct.c_size_t(n),)
         self.call(f"Get{name}", vr, ct.c_size_t(len(vr)), values, *sizes)
@@ -393,17 +393,19 @@ class Instance:
 
     def set(self, kind: str, vr: Any, values: Any) -> None:
         """Set variables of one type."""
-        name, ctype = self._type(kind)
-        flat = np.asarray(values).ravel().tolist()
-        if ctype is ct.c_double:
-            converted = flat
-        elif ctype is ct.c_float:
-            converted = self._singles(kind, vr, flat)
-        else:
-            converted = self._wholes(kind, vr, flat)
-        array = (ctype * max(len(flat), 1))(*converted)
+        name, ctype = c_type(self._version, kind)
+        flat = self.of_type(kind, vr, values)
+        array = (ctype * max(len(flat), 1))(*flat)
         sizes = () if self._version == 2 else (ct.c_size_t(len(flat)),)
         self.call(f"Set{name}", vr, ct.c_size_t(len(vr)), array, *sizes)
+
+    def of_type(self, kind: str, vr: Any, values: Any) -> list[Any]:
+        """Values as numbers of a type, each of them inside it."""
+        _, ctype = c_type(self._version, kind)
+        flat: list[Any] = np.asarray(values).ravel().tolist()
+        if ctype is ct.c_double:
+            return flat
+        return (self._singles if ctype is ct.c_float else self._wholes)(kind, vr, flat)
 
     def _wholes(self, kind: str, vr: Any, values: list[Any]) -> list[int]:
         low, high = limits(kind, self._version)
