@@ -131,6 +131,8 @@ class _EventInfo2(ct.Structure):
 _messages: dict[int, list[str]] = {}
 HEARD: dict[int, list[tuple[int, str]]] = {}
 """By environment, what an instance logged, status and text, until a fleet takes it."""
+ANY_HEARD = ct.c_int64(0)
+"""Not 0 once something was logged, for compiled code to see."""
 _MOST_HEARD = 100
 
 
@@ -142,6 +144,13 @@ def _note(environment: int | None, status: int, text: bytes | None) -> None:
     heard = HEARD.setdefault(environment or 0, [])
     if said and len(heard) < _MOST_HEARD:
         heard.append((int(status), said))
+        ANY_HEARD.value = 1
+
+
+def note_what_waits() -> None:
+    """Let compiled code know whether anything that was logged waits to be shown."""
+    ANY_HEARD.value = 0
+    ANY_HEARD.value = bool(HEARD)
 
 
 def _log_of_fmi2(environment: Any, name: Any, status: Any, category: Any, text: Any) -> None:

@@ -34,8 +34,12 @@ from terrafix.cosim.declare.ports import (
     Port,
 )
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
-from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
-from terrafix.cosim.exchange.fmi.run.fleet import Group, Message, Setup
+from terrafix.cosim.exchange.fmi.run.binding import (
+    CO_SIMULATION,
+    MODEL_EXCHANGE,
+    note_what_waits,
+)
+from terrafix.cosim.exchange.fmi.run.fleet import Fleet, Group, Message, Setup
 from terrafix.cosim.exchange.fmi.run.parameters import (
     EXACT,
     STRUCTURAL,
@@ -58,12 +62,13 @@ from terrafix.cosim.exchange.fmi.run.reading import (
 from terrafix.cosim.exchange.fmi.run.solvers import SOLVERS
 from terrafix.cosim.exchange.fmi.run.telling import Telling
 from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, MOST, cells, read_whole
+from terrafix.cosim.kernels.chain import Compiled, CompiledStep, Copies, can_copy
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.memory.messages import MessageReader
 from terrafix.cosim.memory.slots import BundleView
 
 
-class Fmu(Telling):
+class Fmu(Compiled, Telling):
     """A Functional Mock-up Unit, FMI 2 or 3, one instance for each member.
 
     Ports, units, arrays and start values are those of its model description, and so are parameters,
@@ -614,13 +619,7 @@ class Fmu(Telling):
             for target, source in self._copies:
                 target[...] = source
         self._first = False
-        active = self.environment.active
-        skipped: Sequence[int] = ()
-        if not active.all():
-            gone = ~active & ~self._skipped
-            if gone.any():
-                skipped = np.flatnonzero(gone).tolist()
-                self._skipped |= gone
+        skipped = () if self.environment.active.all() else self._newly_gone()
         messages = self._fresh_messages() if self._messages else ()
         # not dt: the FMU must find the end of its step at t_now + h, to the last bit
         now = t + self._start_time
@@ -630,6 +629,60 @@ class Fmu(Telling):
         for target, source in self._results:
             target[...] = source
         self._publish_messages()
+
+    def _newly_gone(self) -> list[int]:
+        """Rows of members that fly no more since this was last asked."""
+        gone = ~self.environment.active & ~self._skipped
+        self._skipped |= gone
+        rows: list[int] = np.flatnonzero(gone).tolist()
+        return rows
+
+    # ------------------------------------------------------------------ compiled steps
+
+    def compiled_step(self) -> CompiledStep | None:
+        """The step by the compiled driver, where it is signals in, step, signals out."""
+        fleet = self._fleet
+        plain = type(self)._step_impl is Fmu._step_impl and type(self).step is Fmu.step
+        plain &= not (self._messages or self._published)
+        if not plain or self.given_parameters["hold_start_values"]:
+            return None
+        if not isinstance(fleet, Fleet) or fleet.drive is None:
+            return None
+        if not all(can_copy(*pair) for pair in (*self._copies, *self._results)):
+            return None
+        taken = Copies([(target, source, None) for target, source in self._copies])
+        given = Copies([(target, source, None) for target, source in self._results])
+        return fleet.drive.component_step(taken, given, self._start_time)
+
+    def _drive(self) -> tuple[Fleet, Any]:
+        fleet = self._fleet
+        assert isinstance(fleet, Fleet)
+        assert fleet.drive is not None
+        return fleet, fleet.drive.binding
+
+    def begin_compiled(self) -> None:
+        """Tell the driver who flies no more, and where the FMU stands."""
+        fleet, binding = self._drive()
+        if not self.environment.active.all() and (gone := self._newly_gone()):
+            fleet.leave_out(gone)
+        binding.t = self._t
+
+    def end_compiled(self) -> None:
+        """Take over how far the driver has stepped."""
+        _, binding = self._drive()
+        if binding.steps:
+            self.step_index += binding.steps
+            self._first = False
+            self._t, binding.steps = binding.t, 0
+
+    def attend_compiled(self) -> None:
+        """Report what failed or was logged in a step, and publish."""
+        fleet, _ = self._drive()
+        self.end_compiled()
+        self._tell(fleet, fleet.after_compiled())
+        note_what_waits()
+        for target, source in self._results:
+            target[...] = source
 
     # ------------------------------------------------------------------ messages
 

@@ -1,7 +1,7 @@
 /*
  * Steps every instance of one imported FMU in a single call: set, step, get, look for NaN.
  *
- * Compiled with TERRAFIX_KEY defined, its hash. The functions are those of the FMU's binary, FMI 2
+ * Compiled behind copies.c, with TERRAFIX_KEY defined, its hash. The functions are those of the FMU's binary, FMI 2
  * or 3 by `version`; laid out as `_Binding` and `_Group` of cosim/exchange/fmi/run/driver.py.
  */
 #include <stddef.h>
@@ -109,6 +109,11 @@ struct binding {
     size_t n_input_groups, n_output_groups, n_inputs, n_outputs;
     const double *inputs;
     double *outputs;
+    double start_time;        /* of the FMU, where the run has t = 0 */
+    int64_t steps;            /* made by terrafix_step_component since Python last looked */
+    const int64_t *heard;     /* whether an FMU has logged something */
+    const struct copy *taken, *given; /* from ports into rows, and back */
+    size_t n_taken, n_given;
 };
 
 #define MOST_SINGLE 3.40282346638528859812e38
@@ -270,4 +275,21 @@ EXPORT int64_t terrafix_step_fmus(const struct binding *b)
             n_failed += b->failed[m] != NONE;
         }
     return n_failed;
+}
+
+/* The step of a component to time t of the run, and all that belongs to it. Not 0 where something
+ * failed or was logged: what it publishes is then for Python to copy. */
+EXPORT int64_t terrafix_step_component(struct binding *b, double t)
+{
+    double now = t + b->start_time;
+    int64_t n_failed;
+    copy_all(b->taken, (int64_t)b->n_taken);
+    b->h = now - b->t;
+    n_failed = terrafix_step_fmus(b);
+    b->t = now;
+    b->steps++;
+    if (n_failed || *(const volatile int64_t *)b->heard)
+        return 1;
+    copy_all(b->given, (int64_t)b->n_given);
+    return 0;
 }

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
-from terrafix.cosim.exchange.fmi.run.binding import Instance, Library, c_type
+from terrafix.cosim.exchange.fmi.run.binding import ANY_HEARD, Instance, Library, c_type
 from terrafix.cosim.exchange.fmi.run.whole import INTEGER, MOST, limits
 from terrafix.cosim.kernels import toolchain
+from terrafix.cosim.kernels.chain import COPIES, CompiledStep, Copies
 
 NOT_FINITE, ENDED, DISCARDED, NOT_OF_TYPE, TOO_LARGE = 4, 5, 6, 8, 9  # of `enum failure`
 REASONS = {
@@ -70,6 +71,13 @@ class _Binding(ct.Structure):
         ("n_outputs", ct.c_size_t),
         ("inputs", ct.c_void_p),
         ("outputs", ct.c_void_p),
+        ("start_time", ct.c_double),
+        ("steps", ct.c_int64),
+        ("heard", ct.c_void_p),
+        ("taken", ct.c_void_p),
+        ("given", ct.c_void_p),
+        ("n_taken", ct.c_size_t),
+        ("n_given", ct.c_size_t),
     )
 
 
@@ -77,7 +85,8 @@ class _Binding(ct.Structure):
 def load_driver() -> Any:
     """The compiled driver; None where no compiler serves."""
     try:
-        return toolchain.load(Path(__file__).with_name("driver.c").read_text())
+        own = Path(__file__).with_name("driver.c").read_text()
+        return toolchain.load(toolchain.c_source(COPIES) + own)
     except toolchain.CompilationError:
         return None
 
@@ -131,6 +140,17 @@ class Driver:
         self.at = ct.byref(b)
         self.call = compiled["terrafix_step_fmus"]
         self.call.restype = ct.c_int64
+        self._component = compiled["terrafix_step_component"]
+
+    def component_step(self, taken: Copies, given: Copies, start_time: float) -> CompiledStep:
+        """The step of the component, from ports to ports."""
+        b = self.binding
+        self._kept += [taken, given]
+        b.taken, b.n_taken, b.given, b.n_given = taken.at, len(taken), given.at, len(given)
+        b.heard, b.start_time, b.steps = ct.addressof(ANY_HEARD), start_time, 0
+        function = _address(self._component)
+        assert function is not None
+        return CompiledStep(function, ct.addressof(b))
 
     def _groups(
         self, library: Library, verb: str, groups: Sequence[tuple[Any, Any]]

@@ -200,8 +200,10 @@ class Fleet:
     ----------
     inputs, outputs : ndarray, shape (n_members, width)
         Rows that are set before and filled after each step.
+    drive : Driver or None
+        The compiled driver that makes the calls, if there is one.
     driven : bool
-        Whether a compiled driver makes the calls.
+        Whether there is.
     """
 
     def __init__(self, setup: Setup, n_members: int) -> None:
@@ -225,7 +227,7 @@ class Fleet:
         self._active = np.zeros(n_members, dtype=np.uint8)
         self._failed = np.zeros(n_members, dtype=np.uint8)
         self._references = {g: references(g.references) for g in (*setup.inputs, *setup.outputs)}
-        self._drive: Driver | None = None
+        self.drive: Driver | None = None
         self.driven = False
 
     # ------------------------------------------------------------------ life cycle
@@ -365,7 +367,7 @@ class Fleet:
         groups = (self.setup.inputs, self.setup.outputs)
         if compiled is not None:
             read, written = ([(g, self._references[g]) for g in each] for each in groups)
-            self._drive = Driver(
+            self.drive = Driver(
                 compiled,
                 self.library,
                 self.instances,
@@ -396,10 +398,9 @@ class Fleet:
         `skipped` are rows that are not stepped any more.
         """
         if skipped:
-            self._active[list(skipped)] = 0
-            self._live = self._find_live()
+            self.leave_out(skipped)
         failures = self._send(messages) if messages else {}
-        if (drive := self._drive) is not None:
+        if (drive := self.drive) is not None:
             binding = drive.binding
             binding.t, binding.h = t, h
             return failures | self._explain() if drive.call(drive.at) else failures
@@ -411,6 +412,15 @@ class Fleet:
         if failures:
             self._live = self._find_live()
         return failures
+
+    def leave_out(self, rows: Sequence[int]) -> None:
+        """Step some rows no more."""
+        self._active[list(rows)] = 0
+        self._live = self._find_live()
+
+    def after_compiled(self) -> Failures:
+        """What failed in a step that was made by compiled code alone."""
+        return self._explain() if (self._failed * self._active).any() else {}
 
     def _find_live(self) -> list[int]:
         rows: list[int] = np.flatnonzero(self._active & (self._failed == 0)).tolist()
@@ -549,4 +559,4 @@ class Fleet:
             except FmuError:
                 pass  # it is freed all the same
             instance.free()
-        self._drive = None
+        self.drive = None
