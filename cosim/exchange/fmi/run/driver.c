@@ -107,6 +107,7 @@ struct binding {
     void *step;
     const struct group *input, *output;
     size_t n_input_groups, n_output_groups, n_inputs, n_outputs;
+    int64_t plain; /* at most one group each way, of doubles from the first column on */
     const double *inputs;
     double *outputs;
     double start_time;        /* of the FMU, where the run has t = 0 */
@@ -116,6 +117,7 @@ struct binding {
     size_t n_taken, n_given;
 };
 
+#define INLINED static inline __attribute__((always_inline))
 #define MOST_SINGLE 3.40282346638528859812e38
 
 #define PUT(T)                                                                                    \
@@ -191,56 +193,76 @@ static int take(const struct group *g, double *cell)
     return 1;
 }
 
-static int access_group(const struct binding *b, const struct group *g, void *instance,
-                        const void *values)
+INLINED int access_group(const struct binding *b, const struct group *g, void *instance,
+                         const void *values)
 {
     return b->version == 2
         ? ((access2 *)g->access)(instance, g->reference, g->n_references, values)
         : ((access3 *)g->access)(instance, g->reference, g->n_references, values, g->n);
 }
 
-static enum failure set_all(const struct binding *b, void *instance, const double *in,
-                            const struct environment *ours)
+INLINED int all_finite(const double *cell, size_t n)
 {
+    for (size_t k = 0; k < n; k++) {
+        uint64_t bits;
+        memcpy(&bits, &cell[k], sizeof bits);
+        if ((bits >> 52 & 0x7FF) == 0x7FF)
+            return 0;
+    }
+    return 1;
+}
+
+INLINED enum failure set_all(const struct binding *b, void *instance, const double *in,
+                             const struct environment *ours, int plain)
+{
+    if (plain)
+        return b->n_input_groups && access_group(b, b->input, instance, in) > 1 ? SET : NONE;
     for (const struct group *g = b->input; g < b->input + b->n_input_groups; g++) {
-        const double *cell = in + g->start;
-        if (g->type == SINGLE)
-            restore(ours);
-        if (g->type != DOUBLE && !convert(g, cell))
-            return NOT_OF_TYPE;
-        if (access_group(b, g, instance, g->type == DOUBLE ? (const void *)cell : g->room) > 1)
+        const void *values = in + g->start;
+        if (g->type != DOUBLE) {
+            if (g->type == SINGLE)
+                restore(ours);
+            if (!convert(g, values))
+                return NOT_OF_TYPE;
+            values = g->room;
+        }
+        if (access_group(b, g, instance, values) > 1)
             return SET;
     }
     return NONE;
 }
 
-static enum failure get_all(const struct binding *b, void *instance, double *out,
-                            const struct environment *ours)
+INLINED enum failure get_all(const struct binding *b, void *instance, double *out,
+                             const struct environment *ours, int plain)
 {
+    if (plain) {
+        if (b->n_output_groups && access_group(b, b->output, instance, out) > 1)
+            return GET;
+        return all_finite(out, b->n_outputs) ? NONE : NOT_FINITE;
+    }
     const struct group *end = b->output + b->n_output_groups;
     for (const struct group *g = b->output; g < end; g++) {
         double *cell = out + g->start;
         if (access_group(b, g, instance, g->type == DOUBLE ? (void *)cell : g->room) > 1)
             return GET;
+        if (g->type == DOUBLE)
+            continue;
         if (g->type == SINGLE)
             restore(ours); /* which reads subnormals as they are */
-        if (g->type != DOUBLE && !take(g, cell))
+        if (!take(g, cell))
             return TOO_LARGE;
     }
     for (const struct group *g = b->output; g < end; g++)
-        for (size_t k = 0; g->type <= SINGLE && k < g->n; k++) {
-            uint64_t bits;
-            memcpy(&bits, &out[(size_t)g->start + k], sizeof bits);
-            if ((bits >> 52 & 0x7FF) == 0x7FF)
-                return NOT_FINITE;
-        }
+        if (g->type <= SINGLE && !all_finite(out + g->start, g->n))
+            return NOT_FINITE;
     return NONE;
 }
 
-static enum failure step_one(const struct binding *b, void *instance, const double *in, double *out,
-                             const struct environment *ours)
+/* `plain` is a constant where it is called: what the others need costs the plain ones nothing. */
+INLINED enum failure step_one(const struct binding *b, void *instance, const double *in,
+                              double *out, const struct environment *ours, int plain)
 {
-    enum failure found = set_all(b, instance, in, ours), seen;
+    enum failure found = set_all(b, instance, in, ours, plain), seen;
     if (found)
         return found;
     if (b->version == 2) {
@@ -256,7 +278,7 @@ static enum failure step_one(const struct binding *b, void *instance, const doub
             return EARLY;
         found = end ? ENDED : NONE;
     }
-    seen = get_all(b, instance, out, ours);
+    seen = get_all(b, instance, out, ours, plain);
     return seen ? seen : found;
 }
 
@@ -268,8 +290,11 @@ EXPORT int64_t terrafix_step_fmus(const struct binding *b)
     const struct environment ours = environment();
     for (int64_t m = 0; m < b->n_members; m++)
         if (b->active[m] && !b->failed[m]) {
-            b->failed[m] = (uint8_t)step_one(b, b->instance[m], b->inputs + m * b->n_inputs,
-                                             b->outputs + m * b->n_outputs, &ours);
+            void *instance = b->instance[m];
+            const double *in = b->inputs + m * b->n_inputs;
+            double *out = b->outputs + m * b->n_outputs;
+            b->failed[m] = (uint8_t)(b->plain ? step_one(b, instance, in, out, &ours, 1)
+                                              : step_one(b, instance, in, out, &ours, 0));
             restore(&ours);
             END_IF_COPIED;
             n_failed += b->failed[m] != NONE;

@@ -32,6 +32,7 @@ _TYPES = (
     *("Int64", "UInt64", "Boolean2", "Boolean"),
 )
 """In the order of `enum type`."""
+DOUBLE = ("Real", "Float64")
 _SAME = {"Real": "Float64", "Integer": "Int32", "Enumeration": "Int64", "Enumeration2": "Int32"}
 
 
@@ -69,6 +70,7 @@ class _Binding(ct.Structure):
         ("n_output_groups", ct.c_size_t),
         ("n_inputs", ct.c_size_t),
         ("n_outputs", ct.c_size_t),
+        ("plain", ct.c_int64),
         ("inputs", ct.c_void_p),
         ("outputs", ct.c_void_p),
         ("start_time", ct.c_double),
@@ -137,6 +139,10 @@ class Driver:
         b.outputs, b.n_outputs = outputs.ctypes.data, outputs.shape[1]
         b.input, b.n_input_groups = self._groups(library, "Set", read)
         b.output, b.n_output_groups = self._groups(library, "Get", written)
+        b.plain = all(
+            len(each) <= 1 and all(g.kind in DOUBLE and not g.start for g, _ in each)
+            for each in (read, written)
+        )
         self.at = ct.byref(b)
         self.call = compiled["terrafix_step_fmus"]
         self.call.restype = ct.c_int64

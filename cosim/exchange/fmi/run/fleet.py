@@ -32,6 +32,7 @@ from terrafix.cosim.exchange.fmi.run.binding import (
 )
 from terrafix.cosim.exchange.fmi.run.driver import (
     DISCARDED,
+    DOUBLE,
     NOT_FINITE,
     NOT_OF_TYPE,
     REASONS,
@@ -57,7 +58,6 @@ def _said(error: FmuError) -> str:
     return Ended(error) if isinstance(error, FmuEndedError) else str(error)
 
 
-_DOUBLE = ("Real", "Float64")
 _driver = load_driver
 _STEP = 2  # of `enum failure` in driver.c
 
@@ -228,6 +228,7 @@ class Fleet:
         self._failed = np.zeros(n_members, dtype=np.uint8)
         self._references = {g: references(g.references) for g in (*setup.inputs, *setup.outputs)}
         self.drive: Driver | None = None
+        self._call: tuple[Any, Any, Any] | None = None
         self.driven = False
 
     # ------------------------------------------------------------------ life cycle
@@ -378,8 +379,9 @@ class Fleet:
                 read,
                 written,
             )
+            self._call = self.drive.call, self.drive.binding, self.drive.at
             self.driven = True
-        elif all(len(g) <= 1 and all(x.kind in _DOUBLE for x in g) for g in groups):
+        elif all(len(g) <= 1 and all(x.kind in DOUBLE for x in g) for g in groups):
             self._quick = {
                 row: _Quick(instance, self)
                 for row, instance in enumerate(self.instances)
@@ -400,10 +402,10 @@ class Fleet:
         if skipped:
             self.leave_out(skipped)
         failures = self._send(messages) if messages else {}
-        if (drive := self.drive) is not None:
-            binding = drive.binding
+        if self._call is not None:
+            call, binding, at = self._call
             binding.t, binding.h = t, h
-            return failures | self._explain() if drive.call(drive.at) else failures
+            return failures | self._explain() if call(at) else failures
         for row in self._live:
             try:
                 self._step_one(row, t, h)
@@ -559,4 +561,4 @@ class Fleet:
             except FmuError:
                 pass  # it is freed all the same
             instance.free()
-        self.drive = None
+        self.drive = self._call = None
