@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -408,28 +408,30 @@ def all_members(n: int = 100) -> None:
 # --------------------------------------------------------------------------------- a million
 
 
-def million(n: int) -> None:
-    """Print what an FMU with n variables costs: two arrays, as scalars of FMI 2."""
+FORMS = ("locals", "parameters", "arrays", "ports")
+
+
+def million(n: int, form: str) -> None:
+    """Print what an FMU with n variables costs, beside FMPy's reading of it; in its own process."""
     import resource
+
+    from fmpy import read_model_description
 
     half = n // 2
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "million.fmu")
-        library = compiled_wide(half)
-        _write_wide(file, half, library)
+        _write_wide(file, half, form)
 
         def said(what: str, begun: float) -> float:
             used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-            print(f"  {what:<32} {time.perf_counter() - begun:8.2f} s, peak {used:7.0f} MiB")
+            print(f"    {what:<30} {time.perf_counter() - begun:8.2f} s, peak {used:7.0f} MiB")
             return time.perf_counter()
 
-        print(f"{n} variables, {file.stat().st_size / 2**20:.0f} MiB archive")
-        begun = said("before", time.perf_counter())
-        part = Fmu(file=file, rate=Rate(str(STEP)))
-        begun = said("file read", begun)
+        print(f"  {n} variables as {form}, archive of {file.stat().st_size / 2**20:.0f} MiB")
+        begun = time.perf_counter()
         system = System("wide")
-        system.add(part, "part")
-        begun = said("added to a system (prepare)", begun)
+        system.add(Fmu(file=file, rate=Rate(str(STEP))), "part")
+        begun = said("read, parameters and ports", begun)
         simulation = Simulation(system)
         begun = said("checked and built", begun)
         simulation.initialize()
@@ -438,41 +440,39 @@ def million(n: int) -> None:
         said("10 steps", begun)
         simulation.master.terminate()
         begun = time.perf_counter()
-        from fmpy import read_model_description
-
         read_model_description(str(file), validate=False)
-        said("FMPy: read_model_description", begun)
+        said("FMPy reads the description", begun)
 
 
-def compiled_wide(half: int) -> bytes:
-    """A library with `half` inputs and outputs."""
-    text = compiled.__globals__["_C"] + _C_OF[2]
+def _write_wide(file: Path, half: int, form: str) -> None:
+    """Two halves: inputs and outputs as arrays or ports, or other variables beside one of each."""
+    text = _C + _C_OF[2]
     text += _ACCESS.replace("NAME", "Real").replace("TYPE", "double").replace(" SIZE", "")
     text += "".join(f"EXPORT int fmiV{n}(void *m) {{ return 3; }}\n" for n in _UNUSED[2])
     text = text.replace("fmiV", "fmi2").replace('"V.0"', '"2.0"').replace("WIDTH", str(2 * half))
     text = text.replace("WHOLE[k]", "0").replace(" MORE_OF_STEP", "").replace("END_OF_STEP", "")
-    return build({"small.c": text}, ["small.c"], (None,))[host_platform()]
+    library = build({"small.c": text}, ["small.c"], (None,))[host_platform()]
+    name = "{}[{}]" if form == "arrays" else "{}{}"
+    other = {"locals": "local", "parameters": "parameter"}.get(form)
 
-
-def _write_wide(file: Path, half: int, library: bytes) -> None:
-    def variables() -> Any:
-        for k in range(half):
+    def variables() -> Iterator[str]:
+        for k in range(2 * half):
+            side = other if other and k not in (0, half) else ("input", "output")[k >= half]
+            start = ' start="0"' * (side in ("input", "parameter"))
+            fixed = ' variability="fixed"' * (side == "parameter")
+            called = name.format("uy"[k >= half], k % half + 1)
             yield (
-                f'<ScalarVariable name="u[{k + 1}]" valueReference="{k}" causality="input">'
-                '<Real start="0"/></ScalarVariable>'
-            )
-        for k in range(half):
-            yield (
-                f'<ScalarVariable name="y[{k + 1}]" valueReference="{half + k}" '
-                'causality="output"><Real/></ScalarVariable>'
+                f'<ScalarVariable name="{called}" valueReference="{k}" causality="{side}"{fixed}>'
+                f"<Real{start}/></ScalarVariable>"
             )
 
+    outputs = [half] if other else range(half, 2 * half)
     xml = (
         '<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription fmiVersion="2.0" '
         'modelName="small" guid="{1}"><CoSimulation modelIdentifier="small" '
         'canHandleVariableCommunicationStepSize="true"/>'
         f"<ModelVariables>{''.join(variables())}</ModelVariables><ModelStructure><Outputs>"
-        + "".join(f'<Unknown index="{half + k + 1}"/>' for k in range(half))
+        + "".join(f'<Unknown index="{k + 1}"/>' for k in outputs)
         + "</Outputs></ModelStructure></fmiModelDescription>"
     )
     host = host_platform()
@@ -488,11 +488,16 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--how", help=argparse.SUPPRESS)
     parser.add_argument("--variables", type=int, default=1_000_000)
+    parser.add_argument("--form", choices=FORMS)
     options = parser.parse_args()
     if options.what == "steps":
         table(quick=options.quick)
+    elif options.what == "million" and options.form:
+        million(options.variables, options.form)
     elif options.what == "million":
-        million(options.variables)
+        for form in FORMS:
+            given = ("--form", form, "--variables", str(options.variables))
+            subprocess.run([sys.executable, __file__, "million", *given], check=True)
     elif options.how:
         members(options.how, 100)
     else:
