@@ -54,9 +54,9 @@ from terrafix.cosim.exchange.fmi.run.reading import (
     REAL,
     ImportedPort,
     Interface,
+    Observable,
     Quantity,
     initial_dependencies,
-    observed,
     read_interface,
 )
 from terrafix.cosim.exchange.fmi.run.solvers import SOLVERS
@@ -107,7 +107,7 @@ class Fmu(Compiled, Telling):
 
     _interface: Interface | None = None
     _found: tuple[Any, Interface] | None = None
-    _from_start: frozenset[str] = frozenset()
+    _from_start: set[str] | frozenset[str] = frozenset()
     _quantities: dict[str, Quantity]
     _fleet: AnyFleet | None = None
     _needs: dict[str, set[str]] | None = None
@@ -213,6 +213,7 @@ class Fmu(Compiled, Telling):
             self._check_text(name, start[name])
         beyond = {n for n, value in start.items() if self._is_beyond_doubles(n, value)}
         meant = {by_name[n]: n for n in start if n in by_name and n not in beyond}
+        self._from_start = set(self._from_start)
         for own in self.in_order_of_setting(meant):
             where = f"'{self.name}.start.{meant[own]}'"
             if own in self.given_parameters and own not in self._from_start:
@@ -222,8 +223,9 @@ class Fmu(Compiled, Telling):
                 )
             value = self.settings()[own].read(start.pop(meant[own]), where=where)
             self.parameter_values[own] = self.given_parameters[own] = value
-            self._from_start |= {own}
-            self.declare_settings()
+            self._from_start.add(own)
+            if isinstance(self._found_settings[own], Size):
+                self.declare_settings()  # arrays have another size
         self.parameter_values["start"] = self.given_parameters["start"] = start
 
     def _check_text(self, name: str, value: object) -> None:
@@ -253,18 +255,15 @@ class Fmu(Compiled, Telling):
         """Add an output for each variable that `observe` names."""
         interface = self.interface
         taken = {port.name for port in interface.ports}
+        observable = Observable(
+            interface.archive, arrays=self.given_parameters["arrays"], sizes=self._sizes()
+        )
         for name, variable in self.given_parameters["observe"].items():
             where = f"'{self.name}.observe.{name}'"
             if not re.fullmatch(r"[A-Za-z]\w*", name) or name in taken:
                 why = "is a port of the FMU" if name in taken else "is no name of a port"
                 raise ConfigurationError(f"{where}: '{name}' {why}\n  choose another name")
-            quantity = observed(
-                interface.archive,
-                str(variable),
-                arrays=self.given_parameters["arrays"],
-                sizes=self._sizes(),
-                where=where,
-            )
+            quantity = observable.find(str(variable), where)
             port = ImportedPort(name, "signal", False, None, {"": (quantity, None)})
             interface.ports.append(port)
 
@@ -430,7 +429,8 @@ class Fmu(Compiled, Telling):
         """Inputs that an output depends on in initialization mode, as the FMU declares."""
         if self._needs is None:
             self._needs = initial_dependencies(self.interface)
-        return self._needs.get(output, super().needed_by(output))
+        found = self._needs.get(output)
+        return super().needed_by(output) if found is None else found
 
     def begin_start(self) -> None:
         """Instantiate, and enter initialization mode."""
