@@ -70,7 +70,9 @@ def own(file: Path, *, driver: bool) -> float:
     chosen = fleet._driver
     if not driver:
         fleet._driver = lambda: None  # type: ignore[assignment]
-    made.start(np.ones(1, dtype=np.bool_))
+    everybody = np.ones(1, dtype=np.bool_)
+    made.enter(everybody)
+    made.leave(everybody)
     fleet._driver = chosen
     assert made.driven == driver
     ticks = [0]

@@ -97,8 +97,13 @@ class _Settings:
     def __get__(
         self, obj: Component | None, owner: type[Component]
     ) -> Callable[[], dict[str, Setting[object]]]:
+        if obj is not None and obj._all_settings[0] is obj._found_settings:
+            return lambda: obj._all_settings[1]
         declared = {n: d for n, d in owner.declarations.items() if isinstance(d, Setting)}
-        return lambda: declared if obj is None else declared | obj._found_settings
+        if obj is None:
+            return lambda: declared
+        obj._all_settings = _, every = obj._found_settings, declared | obj._found_settings
+        return lambda: every
 
 
 class _CallTip:
@@ -228,6 +233,7 @@ class Component(Shown):
         self.parameter_values: dict[str, Any] = {}
         self.given_parameters: dict[str, Any] = {}
         self._found_settings: dict[str, Setting[object]] = {}
+        self._all_settings: tuple[Any, dict[str, Setting[object]]] = None, {}
         self._environment: Environment | None = None
         self._streams: dict[tuple[str, int], NormalBlocks] = {}
         self.step_index = 0

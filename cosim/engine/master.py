@@ -6,6 +6,7 @@ due, `program` what there is to do then.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Any
@@ -23,8 +24,9 @@ from terrafix.cosim.basics.errors import (
 )
 from terrafix.cosim.engine.agenda import Agenda
 from terrafix.cosim.engine.build import bind_components, connect_ports
-from terrafix.cosim.engine.program import Entry, Program, stretch_of
+from terrafix.cosim.engine.program import Chains, Entry, Program, Run, stretch_of
 from terrafix.cosim.engine.starting import Starter
+from terrafix.cosim.kernels.chain import Chain, Compiled
 from terrafix.cosim.kernels.symbolic import NOT_FINITE, SymbolicComponent
 from terrafix.cosim.system.check import Plan
 from terrafix.cosim.system.dispersion import apply_all
@@ -102,7 +104,16 @@ class Master:
             assert component.rate is not None
             number = self.group_of[path] = self.agenda.number(component.rate)
             self.entries[path] = Entry(path, component, self.agenda.groups[number], self.wiring)
+        self._aloft: list[Chain] = []
+        self._forget_programs()
+
+    def _forget_programs(self) -> None:
+        self._land()
         self.programs: dict[tuple[int, ...], Program] = {}
+        latch = self.wiring.latch
+        self._chains = Chains(
+            lambda path: latch.get(path, ()), self.active, (self._numerator, self._denominator)
+        )
 
     def observe(self, rate: Rate, sample: Callable[[float], None]) -> None:
         """Call `sample(t)` at a rate, after everything due has stepped; it influences nothing."""
@@ -147,6 +158,7 @@ class Master:
 
         `observe` is false where a saved state replaces all of it.
         """
+        self._forget_programs()
         Starter(self.plan, self.entries, self.wiring, self.active, self._component_error).start()
         for path in self.entries:
             for transfer in self.wiring.latch.get(path, ()):
@@ -166,7 +178,11 @@ class Master:
         samples = tuple(s for i in due if (s := groups[i].sample) is not None)
         alone = len(due) == 1 and not samples and groups[due[0]].spacing
         stretch = stretch_of(entries, latches) if alone else None
-        program = self.programs[due] = Program(entries, latches, samples, stretch)
+        runs = self._chains.runs(entries)
+        chain = runs[0].chain if alone and len(runs) == 1 else None
+        if chain is not None and chain.latches is None:
+            chain = None
+        program = self.programs[due] = Program(entries, latches, samples, stretch, runs, chain)
         return program
 
     def _fly(self, program: Program, number: int, end: int) -> bool:
@@ -203,6 +219,79 @@ class Master:
         self.agenda.leap(number, last)
         return True
 
+    # ------------------------------------------------------------------ chains
+
+    def _ready(self, chain: Chain) -> None:
+        """Let a chain take off, once others with components of it have landed."""
+        if not chain.aloft:
+            own = set(chain.components)
+            for other in self._aloft:
+                if not own.isdisjoint(other.components):
+                    other.land()
+            self._aloft = [c for c in self._aloft if c.aloft] + [chain]
+        chain.ready()
+
+    def _land(self) -> None:
+        for chain in self._aloft:
+            chain.land()
+        self._aloft = []
+
+    def _attend(self, chain: Chain, run: Run) -> None:
+        """Let the component for which a chain has stopped do what its step left to do."""
+        entry = run.entries[chain.stage]
+        assert isinstance(entry.component, Compiled)
+        try:
+            entry.component.attend_compiled()
+        except Exception as error:
+            raise self._component_error(entry.path, error) from error
+        chain.ready()
+
+    def _step_run(self, run: Run, chain: Chain, tick: int, t: float) -> None:
+        """Step the components of a chain once."""
+        self._ready(chain)
+        stopped = chain.start(tick, tick, t, latched=False)
+        while stopped:
+            self._attend(chain, run)
+            stopped = chain.go_on()
+
+    def _glide(self, program: Program, number: int, end: int) -> bool:
+        """Fly a group whose components are one chain, as `_fly` does; perhaps not all the way."""
+        group, chain, run = self.agenda.groups[number], program.chain, program.runs[0]
+        assert chain is not None
+        first, spacing = group.next_tick, group.spacing
+        assert first is not None
+        n_ticks = min(self.agenda.alone(number, end), chain.most)
+        last = first + (n_ticks - 1) * spacing
+        if n_ticks < 1 or max(last * self._numerator, self._denominator) > 2**53:
+            return False
+        begun = time.perf_counter()
+        self._ready(chain)
+        tick = first
+        while True:
+            n_excluded = len(self.excluded)
+            stopped = chain.start(tick, last, self.seconds(tick), latched=True)
+            self.tick = chain.tick
+            chain.stop_after_this_tick()
+            while stopped:
+                self._attend(chain, run)
+                stopped = chain.go_on()
+            self.component_steps += ((self.tick - tick) // spacing + 1) * len(run.entries)
+            self.agenda.leap(number, self.tick)
+            if len(self.excluded) != n_excluded:
+                self._check_members()
+            if self._ending:
+                self._end_members()
+            tick = self.tick + spacing
+            if tick > last:
+                break
+            chain.ready()
+        taken = time.perf_counter() - begun
+        if taken < 0.02 and n_ticks == chain.most:
+            chain.most *= 2
+        elif taken > 0.1:
+            chain.most = max(chain.most // 4, 1)
+        return True
+
     def run_until(self, end: int) -> None:
         """Step to tick `end`.
 
@@ -235,17 +324,24 @@ class Master:
                 if program.stretch is not None and self._fly(program, due[0], end):
                     n_excluded = len(self.excluded)
                     continue
+                if program.chain is not None and self._glide(program, due[0], end):
+                    n_excluded = len(self.excluded)
+                    continue
                 agenda.advance(due)
                 self.tick, t = tick, tick * numerator / denominator
-                for entry in program.entries:
-                    for transfer in entry.before:
-                        transfer(tick)
-                    entry.step(t, entry.group.dt)
-                    for collect in entry.after:
-                        collect(tick, t)
-                    for clear in entry.clear:
-                        clear()
-                entry = None
+                for run in program.runs:
+                    if run.chain is not None:
+                        self._step_run(run, run.chain, tick, t)
+                        continue
+                    for entry in run.entries:
+                        for transfer in entry.before:
+                            transfer(tick)
+                        entry.step(t, entry.group.dt)
+                        for collect in entry.after:
+                            collect(tick, t)
+                        for clear in entry.clear:
+                            clear()
+                    entry = None
                 for latch in program.latches:
                     latch(tick)
                 for sample in program.samples:
@@ -265,6 +361,8 @@ class Master:
                 f"'recorder' failed at t = {self.seconds(self.tick):.9g} s (tick {self.tick})\n"
                 f"  {_said(error)}"
             ) from error
+        finally:
+            self._land()
         self.tick = end
 
     def _check_members(self) -> None:
@@ -292,6 +390,7 @@ class Master:
         if self._terminated:
             return
         self._terminated = True
+        self._land()
         failure: tuple[str, Exception] | None = None
         for path, component in self.plan.flat.components.items():
             if component.lent is not self._lent[path]:
@@ -308,6 +407,7 @@ class Master:
 
     def get_state(self) -> dict[str, Any]:
         """Everything that a run needs to continue from here."""
+        self._land()
         return {
             "tick": self.tick,
             "component_steps": self.component_steps,
@@ -320,6 +420,7 @@ class Master:
 
     def set_state(self, saved: dict[str, Any]) -> None:
         """Continue from where `get_state` was called."""
+        self._land()
         self.tick = int(saved["tick"])
         self.component_steps = int(saved["component_steps"])
         self.active[:] = saved["active"]

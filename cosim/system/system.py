@@ -88,6 +88,7 @@ class System(Shown):
         self.epoch = epoch if epoch is None else checked_epoch(epoch)
         self.nodes: dict[str, Component | System] = Nodes()
         self.connections: list[Connection] = []
+        self._drivers: tuple[list[Connection], int, dict[str, Connection]] = [], 0, {}
         self.exposed: dict[str, str] = {}
         self.records: list[Record] = []
         self.dispersions: list[Dispersion] = []
@@ -221,13 +222,13 @@ class System(Shown):
             )
         (_, source_port), (target_leaf, target_port) = found
         check_connection(source_path, source_port, target_path, target_port)
-        for other in self.connections:
-            if self.resolve(other.target)[0] == target_leaf:
-                raise WiringError(
-                    f"input '{target_path}' has two drivers\n"
-                    f"  '{other.source}' is connected to it already\n"
-                    f"  '{source_path}' cannot be connected too: remove one of them"
-                )
+        other = self._driver(target_leaf)
+        if other is not None:
+            raise WiringError(
+                f"input '{target_path}' has two drivers\n"
+                f"  '{other.source}' is connected to it already\n"
+                f"  '{source_path}' cannot be connected too: remove one of them"
+            )
         exact = seconds(delay, f"delay of '{source_path} -> {target_path}'")
         if exact < 0:
             raise RateError(
@@ -240,6 +241,16 @@ class System(Shown):
                 "a delay, not shared values or windows"
             )
         self.connections.append(Connection(source_path, target_path, exact))
+
+    def _driver(self, leaf: str) -> Connection | None:
+        """The connection to a component's input; each is looked at once."""
+        known, n, by_leaf = self._drivers
+        if known is not self.connections or n > len(known):
+            n, by_leaf = 0, {}
+        for connection in self.connections[n:]:
+            by_leaf.setdefault(self.resolve(connection.target)[0], connection)
+        self._drivers = self.connections, len(self.connections), by_leaf
+        return by_leaf.get(leaf)
 
     def record(
         self,

@@ -137,6 +137,8 @@ SPEAKERS: dict[Any, int] = {}
 """Environments of instances that a message names by other means (FMI 1): pointer, or name."""
 HEARD: dict[int, list[tuple[int, str]]] = {}
 """By environment, what an instance logged, status and text, until a fleet takes it."""
+ANY_HEARD = ct.c_int64(0)
+"""Not 0 once something was logged, for compiled code to see."""
 _MOST_HEARD = 100
 
 
@@ -148,6 +150,13 @@ def _note(environment: int | None, status: int, text: bytes | None) -> None:
     heard = HEARD.setdefault(environment or 0, [])
     if said and len(heard) < _MOST_HEARD:
         heard.append((int(status), said))
+        ANY_HEARD.value = 1
+
+
+def note_what_waits() -> None:
+    """Let compiled code know whether anything that was logged waits to be shown."""
+    ANY_HEARD.value = 0
+    ANY_HEARD.value = bool(HEARD)
 
 
 def _log_of_fmi2(environment: Any, name: Any, status: Any, category: Any, text: Any) -> None:
@@ -260,6 +269,12 @@ def was_instantiated(archive: Archive, kind: str) -> bool:
 def references(values: Sequence[int]) -> Any:
     """Value references as C takes them."""
     return (ct.c_uint32 * len(values))(*values)
+
+
+def c_type(version: int, kind: str) -> tuple[str, Any]:
+    """How functions name the type of a variable, and what C has for it."""
+    own = "Enumeration2" if kind == "Enumeration" else f"{kind}{version}"
+    return _TYPES[own if version < 3 and own in _TYPES else kind]
 
 
 class Instance:
@@ -406,13 +421,9 @@ class Instance:
 
     # ------------------------------------------------------------------ variables
 
-    def _type(self, kind: str) -> tuple[str, Any]:
-        own = "Enumeration2" if kind == "Enumeration" else f"{kind}{self._version}"
-        return _TYPES[own if self._version < 3 and own in _TYPES else kind]
-
     def get(self, kind: str, vr: Any, n: int) -> NDArray[Any]:
         """Values of variables of one type, `n` numbers in all."""
-        name, ctype = self._type(kind)
+        name, ctype = c_type(self._version, kind)
         values = (ctype * max(n, 1))()
         sizes = () if self._version < 3 else (ct.c_size_t(n),)
         self.call(f"Get{name}", vr, ct.c_size_t(len(vr)), values, *sizes)
@@ -420,17 +431,19 @@ class Instance:
 
     def set(self, kind: str, vr: Any, values: Any) -> None:
         """Set variables of one type."""
-        name, ctype = self._type(kind)
-        flat = np.asarray(values).ravel().tolist()
-        if ctype is ct.c_double:
-            converted = flat
-        elif ctype is ct.c_float:
-            converted = self._singles(kind, vr, flat)
-        else:
-            converted = self._wholes(kind, vr, flat)
-        array = (ctype * max(len(flat), 1))(*converted)
+        name, ctype = c_type(self._version, kind)
+        flat = self.of_type(kind, vr, values)
+        array = (ctype * max(len(flat), 1))(*flat)
         sizes = () if self._version < 3 else (ct.c_size_t(len(flat)),)
         self.call(f"Set{name}", vr, ct.c_size_t(len(vr)), array, *sizes)
+
+    def of_type(self, kind: str, vr: Any, values: Any) -> list[Any]:
+        """Values as numbers of a type, each of them inside it."""
+        _, ctype = c_type(self._version, kind)
+        flat: list[Any] = np.asarray(values).ravel().tolist()
+        if ctype is ct.c_double:
+            return flat
+        return (self._singles if ctype is ct.c_float else self._wholes)(kind, vr, flat)
 
     def _wholes(self, kind: str, vr: Any, values: list[Any]) -> list[int]:
         low, high = limits(kind, self._version)

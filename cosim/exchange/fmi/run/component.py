@@ -34,8 +34,12 @@ from terrafix.cosim.declare.ports import (
     Port,
 )
 from terrafix.cosim.exchange.fmi.run.archive import is_c_name, open_archive
-from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
-from terrafix.cosim.exchange.fmi.run.fleet import Group, Message, Setup
+from terrafix.cosim.exchange.fmi.run.binding import (
+    CO_SIMULATION,
+    MODEL_EXCHANGE,
+    note_what_waits,
+)
+from terrafix.cosim.exchange.fmi.run.fleet import Fleet, Group, Message, Setup
 from terrafix.cosim.exchange.fmi.run.parameters import (
     EXACT,
     STRUCTURAL,
@@ -50,20 +54,21 @@ from terrafix.cosim.exchange.fmi.run.reading import (
     REAL,
     ImportedPort,
     Interface,
+    Observable,
     Quantity,
     initial_dependencies,
-    observed,
     read_interface,
 )
 from terrafix.cosim.exchange.fmi.run.solvers import SOLVERS
 from terrafix.cosim.exchange.fmi.run.telling import Telling
 from terrafix.cosim.exchange.fmi.run.whole import BOOLEAN, INTEGER, MOST, cells, read_whole
+from terrafix.cosim.kernels.chain import Compiled, CompiledStep, Copies, can_copy
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.memory.messages import MessageReader
 from terrafix.cosim.memory.slots import BundleView
 
 
-class Fmu(Telling):
+class Fmu(Compiled, Telling):
     """A Functional Mock-up Unit, FMI 2 or 3 (1.0: co-simulation), one instance for each member.
 
     Ports, units, arrays and start values are those of its model description, and so are parameters,
@@ -102,7 +107,7 @@ class Fmu(Telling):
 
     _interface: Interface | None = None
     _found: tuple[Any, Interface] | None = None
-    _from_start: frozenset[str] = frozenset()
+    _from_start: set[str] | frozenset[str] = frozenset()
     _quantities: dict[str, Quantity]
     _fleet: AnyFleet | None = None
     _needs: dict[str, set[str]] | None = None
@@ -230,6 +235,7 @@ class Fmu(Telling):
             self._check_text(name, start[name])
         beyond = {n for n, value in start.items() if self._is_beyond_doubles(n, value)}
         meant = {by_name[n]: n for n in start if n in by_name and n not in beyond}
+        self._from_start = set(self._from_start)
         for own in self.in_order_of_setting(meant):
             where = f"'{self.name}.start.{meant[own]}'"
             if own in self.given_parameters and own not in self._from_start:
@@ -239,8 +245,9 @@ class Fmu(Telling):
                 )
             value = self.settings()[own].read(start.pop(meant[own]), where=where)
             self.parameter_values[own] = self.given_parameters[own] = value
-            self._from_start |= {own}
-            self.declare_settings()
+            self._from_start.add(own)
+            if isinstance(self._found_settings[own], Size):
+                self.declare_settings()  # arrays have another size
         self.parameter_values["start"] = self.given_parameters["start"] = start
 
     def _check_text(self, name: str, value: object) -> None:
@@ -270,18 +277,15 @@ class Fmu(Telling):
         """Add an output for each variable that `observe` names."""
         interface = self.interface
         taken = {port.name for port in interface.ports}
+        observable = Observable(
+            interface.archive, arrays=self.given_parameters["arrays"], sizes=self._sizes()
+        )
         for name, variable in self.given_parameters["observe"].items():
             where = f"'{self.name}.observe.{name}'"
             if not re.fullmatch(r"[A-Za-z]\w*", name) or name in taken:
                 why = "is a port of the FMU" if name in taken else "is no name of a port"
                 raise ConfigurationError(f"{where}: '{name}' {why}\n  choose another name")
-            quantity = observed(
-                interface.archive,
-                str(variable),
-                arrays=self.given_parameters["arrays"],
-                sizes=self._sizes(),
-                where=where,
-            )
+            quantity = observable.find(str(variable), where)
             port = ImportedPort(name, "signal", False, None, {"": (quantity, None)})
             interface.ports.append(port)
 
@@ -447,7 +451,8 @@ class Fmu(Telling):
         """Inputs that an output depends on in initialization mode, as the FMU declares."""
         if self._needs is None:
             self._needs = initial_dependencies(self.interface)
-        return self._needs.get(output, super().needed_by(output))
+        found = self._needs.get(output)
+        return super().needed_by(output) if found is None else found
 
     def begin_start(self) -> None:
         """Instantiate, and enter initialization mode."""
@@ -623,13 +628,7 @@ class Fmu(Telling):
             for target, source in self._copies:
                 target[...] = source
         self._first = False
-        active = self.environment.active
-        skipped: Sequence[int] = ()
-        if not active.all():
-            gone = ~active & ~self._skipped
-            if gone.any():
-                skipped = np.flatnonzero(gone).tolist()
-                self._skipped |= gone
+        skipped = () if self.environment.active.all() else self._newly_gone()
         messages = self._fresh_messages() if self._messages else ()
         # not dt: the FMU must find the end of its step at t_now + h, to the last bit
         now = t + self._start_time
@@ -639,6 +638,60 @@ class Fmu(Telling):
         for target, source in self._results:
             target[...] = source
         self._publish_messages()
+
+    def _newly_gone(self) -> list[int]:
+        """Rows of members that fly no more since this was last asked."""
+        gone = ~self.environment.active & ~self._skipped
+        self._skipped |= gone
+        rows: list[int] = np.flatnonzero(gone).tolist()
+        return rows
+
+    # ------------------------------------------------------------------ compiled steps
+
+    def compiled_step(self) -> CompiledStep | None:
+        """The step by the compiled driver, where it is signals in, step, signals out."""
+        fleet = self._fleet
+        plain = type(self)._step_impl is Fmu._step_impl and type(self).step is Fmu.step
+        plain &= not (self._messages or self._published)
+        if not plain or self.given_parameters["hold_start_values"]:
+            return None
+        if not isinstance(fleet, Fleet) or fleet.drive is None:
+            return None
+        if not all(can_copy(*pair) for pair in (*self._copies, *self._results)):
+            return None
+        taken = Copies([(target, source, None) for target, source in self._copies])
+        given = Copies([(target, source, None) for target, source in self._results])
+        return fleet.drive.component_step(taken, given, self._start_time)
+
+    def _drive(self) -> tuple[Fleet, Any]:
+        fleet = self._fleet
+        assert isinstance(fleet, Fleet)
+        assert fleet.drive is not None
+        return fleet, fleet.drive.binding
+
+    def begin_compiled(self) -> None:
+        """Tell the driver who flies no more, and where the FMU stands."""
+        fleet, binding = self._drive()
+        if not self.environment.active.all() and (gone := self._newly_gone()):
+            fleet.leave_out(gone)
+        binding.t = self._t
+
+    def end_compiled(self) -> None:
+        """Take over how far the driver has stepped."""
+        _, binding = self._drive()
+        if binding.steps:
+            self.step_index += binding.steps
+            self._first = False
+            self._t, binding.steps = binding.t, 0
+
+    def attend_compiled(self) -> None:
+        """Report what failed or was logged in a step, and publish."""
+        fleet, _ = self._drive()
+        self.end_compiled()
+        self._tell(fleet, fleet.after_compiled())
+        note_what_waits()
+        for target, source in self._results:
+            target[...] = source
 
     # ------------------------------------------------------------------ messages
 

@@ -1,8 +1,8 @@
 /*
  * Steps every instance of one imported FMU in a single call: set, step, get, look for NaN.
  *
- * Compiled with TERRAFIX_KEY defined, its hash. The functions are those of the FMU's binary, FMI 2
- * or 3 by `version`; laid out as `_Binding` of cosim/fmi/fleet.py.
+ * Compiled behind copies.c, with TERRAFIX_KEY defined, its hash. The functions are those of the FMU's binary, FMI 2
+ * or 3 by `version`; laid out as `_Binding` and `_Group` of cosim/exchange/fmi/run/driver.py.
  */
 #include <stddef.h>
 #include <stdint.h>
@@ -78,14 +78,25 @@ static volatile int *this_process(void)
 
 EXPORT const char terrafix_key[] = TERRAFIX_KEY;
 
-typedef int set2(void *, const uint32_t *, size_t, const double *);
-typedef int get2(void *, const uint32_t *, size_t, double *);
+typedef int access2(void *, const uint32_t *, size_t, const void *);
+typedef int access3(void *, const uint32_t *, size_t, const void *, size_t);
 typedef int step2(void *, double, double, int);
-typedef int set3(void *, const uint32_t *, size_t, const double *, size_t);
-typedef int get3(void *, const uint32_t *, size_t, double *, size_t);
 typedef int step3(void *, double, double, _Bool, _Bool *, _Bool *, _Bool *, double *);
 
-enum failure { NONE, SET, STEP, GET, NOT_FINITE, ENDED, DISCARDED, EARLY };
+enum failure { NONE, SET, STEP, GET, NOT_FINITE, ENDED, DISCARDED, EARLY, NOT_OF_TYPE, TOO_LARGE };
+
+enum type { DOUBLE, SINGLE, I8, U8, I16, U16, I32, U32, I64, U64, TRUTH_OF_2, TRUTH_OF_3 };
+
+/* Variables of one type, side by side in a row from `start` on. A cell of a row is a double; of a
+ * whole number its 64 bits. */
+struct group {
+    void *access; /* the FMU's function that sets or gets them */
+    const uint32_t *reference;
+    size_t n_references, n;
+    int64_t start, type;
+    int64_t low, high; /* of a whole number that is set */
+    void *room;        /* for n values of the type */
+};
 
 struct binding {
     double t, h;
@@ -93,48 +104,182 @@ struct binding {
     void **instance;
     const uint8_t *active;
     uint8_t *failed; /* enum failure; an instance that failed is not stepped */
-    void *set, *step, *get;
-    const uint32_t *input_reference, *output_reference;
-    size_t n_input_references, n_inputs, n_output_references, n_outputs;
-    const double *input;
-    double *output;
+    void *step;
+    const struct group *input, *output;
+    size_t n_input_groups, n_output_groups, n_inputs, n_outputs;
+    int64_t plain; /* at most one group each way, of doubles from the first column on */
+    const double *inputs;
+    double *outputs;
+    double start_time;        /* of the FMU, where the run has t = 0 */
+    int64_t steps;            /* made by terrafix_step_component since Python last looked */
+    const int64_t *heard;     /* whether an FMU has logged something */
+    const struct copy *taken, *given; /* from ports into rows, and back */
+    size_t n_taken, n_given;
 };
 
-static enum failure step_one(const struct binding *b, void *instance, const double *in, double *out)
+#define INLINED static inline __attribute__((always_inline))
+#define MOST_SINGLE 3.40282346638528859812e38
+
+#define PUT(T)                                                                                    \
+    do {                                                                                          \
+        for (size_t k = 0; k < g->n; k++)                                                         \
+            ((T *)g->room)[k] = (T)whole[k];                                                      \
+    } while (0)
+
+/* Write cells as values of the FMU's type; 0 where one is no value of it. */
+static int convert(const struct group *g, const double *cell)
 {
-    enum failure found = NONE;
-    if (b->version == 2) {
-        if (b->n_inputs && ((set2 *)b->set)(instance, b->input_reference, b->n_inputs, in) > 1)
+    const int64_t *whole = (const int64_t *)cell;
+    if (g->type == SINGLE) {
+        for (size_t k = 0; k < g->n; k++) {
+            double size = cell[k] < 0 ? -cell[k] : cell[k];
+            if (size > MOST_SINGLE && size <= 1.7976931348623157e308)
+                return 0;
+            ((float *)g->room)[k] = (float)cell[k];
+        }
+        return 1;
+    }
+    if (g->type == TRUTH_OF_2 || g->type == TRUTH_OF_3) {
+        for (size_t k = 0; k < g->n; k++) {
+            if (cell[k] != 0.0 && cell[k] != 1.0)
+                return 0;
+            if (g->type == TRUTH_OF_2)
+                ((int *)g->room)[k] = cell[k] == 1.0;
+            else
+                ((_Bool *)g->room)[k] = cell[k] == 1.0;
+        }
+        return 1;
+    }
+    for (size_t k = 0; k < g->n; k++)
+        if (whole[k] < g->low || whole[k] > g->high)
+            return 0;
+    switch (g->type) {
+    case I8: case U8: PUT(int8_t); break;
+    case I16: case U16: PUT(int16_t); break;
+    case I32: case U32: PUT(int32_t); break;
+    default: PUT(int64_t);
+    }
+    return 1;
+}
+
+#define TAKE(T, C)                                                                                \
+    do {                                                                                          \
+        for (size_t k = 0; k < g->n; k++)                                                         \
+            ((C *)cell)[k] = (C)((const T *)g->room)[k];                                          \
+    } while (0)
+
+/* Read values of the FMU's type into cells; 0 where a cell does not hold one. */
+static int take(const struct group *g, double *cell)
+{
+    switch (g->type) {
+    case SINGLE: TAKE(float, double); break;
+    case TRUTH_OF_2: TAKE(int, double); break;
+    case TRUTH_OF_3:
+        for (size_t k = 0; k < g->n; k++)
+            cell[k] = ((const uint8_t *)g->room)[k] != 0;
+        break;
+    case I8: TAKE(int8_t, int64_t); break;
+    case U8: TAKE(uint8_t, int64_t); break;
+    case I16: TAKE(int16_t, int64_t); break;
+    case U16: TAKE(uint16_t, int64_t); break;
+    case I32: TAKE(int32_t, int64_t); break;
+    case U32: TAKE(uint32_t, int64_t); break;
+    default: TAKE(int64_t, int64_t);
+    }
+    if (g->type == U64)
+        for (size_t k = 0; k < g->n; k++)
+            if (((int64_t *)cell)[k] < 0)
+                return 0;
+    return 1;
+}
+
+INLINED int access_group(const struct binding *b, const struct group *g, void *instance,
+                         const void *values)
+{
+    return b->version == 2
+        ? ((access2 *)g->access)(instance, g->reference, g->n_references, values)
+        : ((access3 *)g->access)(instance, g->reference, g->n_references, values, g->n);
+}
+
+INLINED int all_finite(const double *cell, size_t n)
+{
+    for (size_t k = 0; k < n; k++) {
+        uint64_t bits;
+        memcpy(&bits, &cell[k], sizeof bits);
+        if ((bits >> 52 & 0x7FF) == 0x7FF)
+            return 0;
+    }
+    return 1;
+}
+
+INLINED enum failure set_all(const struct binding *b, void *instance, const double *in,
+                             const struct environment *ours, int plain)
+{
+    if (plain)
+        return b->n_input_groups && access_group(b, b->input, instance, in) > 1 ? SET : NONE;
+    for (const struct group *g = b->input; g < b->input + b->n_input_groups; g++) {
+        const void *values = in + g->start;
+        if (g->type != DOUBLE) {
+            if (g->type == SINGLE)
+                restore(ours);
+            if (!convert(g, values))
+                return NOT_OF_TYPE;
+            values = g->room;
+        }
+        if (access_group(b, g, instance, values) > 1)
             return SET;
+    }
+    return NONE;
+}
+
+INLINED enum failure get_all(const struct binding *b, void *instance, double *out,
+                             const struct environment *ours, int plain)
+{
+    if (plain) {
+        if (b->n_output_groups && access_group(b, b->output, instance, out) > 1)
+            return GET;
+        return all_finite(out, b->n_outputs) ? NONE : NOT_FINITE;
+    }
+    const struct group *end = b->output + b->n_output_groups;
+    for (const struct group *g = b->output; g < end; g++) {
+        double *cell = out + g->start;
+        if (access_group(b, g, instance, g->type == DOUBLE ? (void *)cell : g->room) > 1)
+            return GET;
+        if (g->type == DOUBLE)
+            continue;
+        if (g->type == SINGLE)
+            restore(ours); /* which reads subnormals as they are */
+        if (!take(g, cell))
+            return TOO_LARGE;
+    }
+    for (const struct group *g = b->output; g < end; g++)
+        if (g->type <= SINGLE && !all_finite(out + g->start, g->n))
+            return NOT_FINITE;
+    return NONE;
+}
+
+/* `plain` is a constant where it is called: what the others need costs the plain ones nothing. */
+INLINED enum failure step_one(const struct binding *b, void *instance, const double *in,
+                              double *out, const struct environment *ours, int plain)
+{
+    enum failure found = set_all(b, instance, in, ours, plain), seen;
+    if (found)
+        return found;
+    if (b->version == 2) {
         int status = ((step2 *)b->step)(instance, b->t, b->h, 1);
         if (status > 1)
             return status == 2 ? DISCARDED : STEP;
-        if (b->n_outputs && ((get2 *)b->get)(instance, b->output_reference, b->n_outputs, out) > 1)
-            return GET;
     } else {
-        _Bool event, end, early;
-        double last;
-        if (b->n_inputs
-            && ((set3 *)b->set)(instance, b->input_reference, b->n_input_references, in,
-                                b->n_inputs) > 1)
-            return SET;
+        _Bool event = 0, end = 0, early = 0;
+        double last = b->t;
         if (((step3 *)b->step)(instance, b->t, b->h, 1, &event, &end, &early, &last) > 1)
             return STEP;
-        if (early && !end)
+        if (early && !end && last < b->t + b->h)
             return EARLY;
         found = end ? ENDED : NONE;
-        if (b->n_outputs
-            && ((get3 *)b->get)(instance, b->output_reference, b->n_output_references, out,
-                                b->n_outputs) > 1)
-            return GET;
     }
-    for (size_t k = 0; k < b->n_outputs; k++) {
-        uint64_t bits;
-        memcpy(&bits, &out[k], sizeof bits);
-        if ((bits >> 52 & 0x7FF) == 0x7FF)
-            return NOT_FINITE;
-    }
-    return found;
+    seen = get_all(b, instance, out, ours, plain);
+    return seen ? seen : found;
 }
 
 /* Step all that are active; how many failed. */
@@ -145,11 +290,31 @@ EXPORT int64_t terrafix_step_fmus(const struct binding *b)
     const struct environment ours = environment();
     for (int64_t m = 0; m < b->n_members; m++)
         if (b->active[m] && !b->failed[m]) {
-            b->failed[m] = (uint8_t)step_one(b, b->instance[m], b->input + m * b->n_inputs,
-                                             b->output + m * b->n_outputs);
+            void *instance = b->instance[m];
+            const double *in = b->inputs + m * b->n_inputs;
+            double *out = b->outputs + m * b->n_outputs;
+            b->failed[m] = (uint8_t)(b->plain ? step_one(b, instance, in, out, &ours, 1)
+                                              : step_one(b, instance, in, out, &ours, 0));
             restore(&ours);
             END_IF_COPIED;
             n_failed += b->failed[m] != NONE;
         }
     return n_failed;
+}
+
+/* The step of a component to time t of the run, and all that belongs to it. Not 0 where something
+ * failed or was logged: what it publishes is then for Python to copy. */
+EXPORT int64_t terrafix_step_component(struct binding *b, double t)
+{
+    double now = t + b->start_time;
+    int64_t n_failed;
+    copy_all(b->taken, (int64_t)b->n_taken);
+    b->h = now - b->t;
+    n_failed = terrafix_step_fmus(b);
+    b->t = now;
+    b->steps++;
+    if (n_failed || *(const volatile int64_t *)b->heard)
+        return 1;
+    copy_all(b->given, (int64_t)b->n_given);
+    return 0;
 }

@@ -11,8 +11,6 @@ from __future__ import annotations
 import ctypes as ct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,11 +30,21 @@ from terrafix.cosim.exchange.fmi.run.binding import (
     load_library,
     references,
 )
+from terrafix.cosim.exchange.fmi.run.driver import (
+    DISCARDED,
+    DOUBLE,
+    NOT_FINITE,
+    NOT_OF_TYPE,
+    REASONS,
+    TOO_LARGE,
+    Driver,
+    load_driver,
+)
+from terrafix.cosim.exchange.fmi.run.driver import ENDED as HAS_ENDED
 from terrafix.cosim.exchange.fmi.run.fmi1 import InstanceOfFmi1
 from terrafix.cosim.exchange.fmi.run.parameters import Start
 from terrafix.cosim.exchange.fmi.run.solvers import Integrator
 from terrafix.cosim.exchange.fmi.run.whole import INTEGER, MOST, cells
-from terrafix.cosim.kernels import toolchain
 
 Failures = dict[int, str]
 """Row of a member to what went wrong, or to an `Ended`."""
@@ -51,15 +59,8 @@ def _said(error: FmuError) -> str:
     return Ended(error) if isinstance(error, FmuEndedError) else str(error)
 
 
-_DOUBLE = ("Real", "Float64")
-_STEP, _NOT_FINITE, _ENDED, _DISCARDED = 2, 4, 5, 6  # of `enum failure` in driver.c
-_REASONS = {
-    1: "Set: inputs were refused",
-    2: "DoStep did not succeed",
-    3: "Get: outputs could not be read",
-    6: "DoStep did not succeed",
-    7: "DoStep: the FMU returned early",
-}
+_driver = load_driver
+_STEP = 2  # of `enum failure` in driver.c
 
 
 @dataclass(frozen=True)
@@ -157,10 +158,10 @@ class _Quick:
         self._step.restype = ct.c_int
         flags, last = [ct.c_bool() for _ in range(3)], ct.c_double()
         after: tuple[Any, ...] = (1,)
-        self._ended: tuple[Any, Any] | None = None
+        self._ended: tuple[Any, Any, Any] | None = None
         if library.version == 3:
             after = (ct.c_bool(True), *(ct.byref(f) for f in flags), ct.byref(last))
-            self._ended = flags[1], flags[2]
+            self._ended = flags[1], flags[2], last
         self._step_arguments = (instance.pointer, self._t, self._h, *after)
 
     def __call__(self, t: float, h: float) -> None:
@@ -172,41 +173,20 @@ class _Quick:
 
     def _call(self) -> None:
         if self._set is not None and self._set(*self._set_arguments) > 1:
-            raise FmuError(f"{_REASONS[1]}{self._instance.said()}")
+            raise FmuError(f"{REASONS[1]}{self._instance.said()}")
         status = self._step(*self._step_arguments)
         if status > 1:
             if status == DISCARD and self._instance.ended():
                 raise FmuEndedError(ENDED)
-            raise FmuError(f"{_REASONS[2]}{self._instance.said()}")
+            raise FmuError(f"{REASONS[2]}{self._instance.said()}")
         if self._ended is not None and (self._ended[0].value or self._ended[1].value):
-            raise FmuEndedError(ENDED) if self._ended[0].value else FmuError(_REASONS[7])
+            ended, _, last = self._ended
+            if ended.value:
+                raise FmuEndedError(ENDED)
+            if last.value < self._t.value + self._h.value:
+                raise FmuError(f"fmi3{REASONS[7]}")
         if self._get is not None and self._get(*self._get_arguments) > 1:
-            raise FmuError(f"{_REASONS[3]}{self._instance.said()}")
-
-
-class _Binding(ct.Structure):
-    """``struct binding`` of ``driver.c``."""
-
-    _fields_ = (
-        ("t", ct.c_double),
-        ("h", ct.c_double),
-        ("version", ct.c_int64),
-        ("n_members", ct.c_int64),
-        ("instance", ct.c_void_p),
-        ("active", ct.c_void_p),
-        ("failed", ct.c_void_p),
-        ("set", ct.c_void_p),
-        ("step", ct.c_void_p),
-        ("get", ct.c_void_p),
-        ("input_reference", ct.c_void_p),
-        ("output_reference", ct.c_void_p),
-        ("n_input_references", ct.c_size_t),
-        ("n_inputs", ct.c_size_t),
-        ("n_output_references", ct.c_size_t),
-        ("n_outputs", ct.c_size_t),
-        ("input", ct.c_void_p),
-        ("output", ct.c_void_p),
-    )
+            raise FmuError(f"{REASONS[3]}{self._instance.said()}")
 
 
 class Fleet:
@@ -221,8 +201,10 @@ class Fleet:
     ----------
     inputs, outputs : ndarray, shape (n_members, width)
         Rows that are set before and filled after each step.
+    drive : Driver or None
+        The compiled driver that makes the calls, if there is one.
     driven : bool
-        Whether a compiled driver makes the calls.
+        Whether there is.
     """
 
     def __init__(self, setup: Setup, n_members: int) -> None:
@@ -246,7 +228,8 @@ class Fleet:
         self._active = np.zeros(n_members, dtype=np.uint8)
         self._failed = np.zeros(n_members, dtype=np.uint8)
         self._references = {g: references(g.references) for g in (*setup.inputs, *setup.outputs)}
-        self._drive: Any = None
+        self.drive: Driver | None = None
+        self._call: tuple[Any, Any, Any] | None = None
         self.driven = False
 
     # ------------------------------------------------------------------ life cycle
@@ -376,46 +359,36 @@ class Fleet:
     # ------------------------------------------------------------------ stepping
 
     def _prepare_calls(self) -> None:
-        """Prepare calls without any conversion, where all signals are double precision.
+        """Prepare the calls of a step, where they are set, step and get.
 
-        A compiled driver makes them; where no compiler serves, this process does.
+        A compiled driver makes them; where no compiler serves, this process does, those of double
+        precision without any conversion.
         """
+        if self.setup.kind != CO_SIMULATION or self.setup.event_mode or self.library.version == 1:
+            return
+        compiled = _driver()
         groups = (self.setup.inputs, self.setup.outputs)
-        real = all(len(g) <= 1 and all(x.kind in _DOUBLE for x in g) for g in groups)
-        if not real or self.setup.kind != CO_SIMULATION or self.setup.event_mode:
-            return
-        if self.library.version == 1:
-            return
-        self._quick = {
-            row: _Quick(instance, self)
-            for row, instance in enumerate(self.instances)
-            if instance is not None
-        }
-        library = _driver()
-        if library is None:
-            return
-        pointers = (ct.c_void_p * len(self.instances))(
-            *(i.pointer.value if i is not None and i.pointer else None for i in self.instances)
-        )
-        b = _Binding(version=self.library.version, n_members=len(self.instances))
-        b.instance = ct.addressof(pointers)
-        b.active, b.failed = self._active.ctypes.data, self._failed.ctypes.data
-        name = "Real" if self.library.version == 2 else "Float64"
-        for field, function in (("set", f"Set{name}"), ("step", "DoStep"), ("get", f"Get{name}")):
-            setattr(b, field, ct.cast(self.library[function], ct.c_void_p).value)
-        for field, rows, group in zip(
-            ("input", "output"), (self.inputs, self.outputs), groups, strict=True
-        ):
-            setattr(b, field, rows.ctypes.data)
-            setattr(b, f"n_{field}s", rows.shape[1])
-            if group:
-                vr = self._references[group[0]]
-                setattr(b, f"{field}_reference", ct.addressof(vr))
-                setattr(b, f"n_{field}_references", len(vr))
-        step = library["terrafix_step_fmus"]
-        step.restype = ct.c_int64
-        self._drive = (step, b, ct.byref(b), pointers)
-        self.driven = True
+        if compiled is not None:
+            read, written = ([(g, self._references[g]) for g in each] for each in groups)
+            self.drive = Driver(
+                compiled,
+                self.library,
+                self.instances,
+                self._active,
+                self._failed,
+                self.inputs,
+                self.outputs,
+                read,
+                written,
+            )
+            self._call = self.drive.call, self.drive.binding, self.drive.at
+            self.driven = True
+        elif all(len(g) <= 1 and all(x.kind in DOUBLE for x in g) for g in groups):
+            self._quick = {
+                row: _Quick(instance, self)
+                for row, instance in enumerate(self.instances)
+                if instance is not None
+            }
 
     def step(
         self,
@@ -429,13 +402,12 @@ class Fleet:
         `skipped` are rows that are not stepped any more.
         """
         if skipped:
-            self._active[list(skipped)] = 0
-            self._live = self._find_live()
+            self.leave_out(skipped)
         failures = self._send(messages) if messages else {}
-        if self._drive is not None:
-            step, b, reference, _ = self._drive
-            b.t, b.h = t, h
-            return failures | self._explain() if step(reference) else failures
+        if self._call is not None:
+            call, binding, at = self._call
+            binding.t, binding.h = t, h
+            return failures | self._explain() if call(at) else failures
         for row in self._live:
             try:
                 self._step_one(row, t, h)
@@ -444,6 +416,15 @@ class Fleet:
         if failures:
             self._live = self._find_live()
         return failures
+
+    def leave_out(self, rows: Sequence[int]) -> None:
+        """Step some rows no more."""
+        self._active[list(rows)] = 0
+        self._live = self._find_live()
+
+    def after_compiled(self) -> Failures:
+        """What failed in a step that was made by compiled code alone."""
+        return self._explain() if (self._failed * self._active).any() else {}
 
     def _find_live(self) -> list[int]:
         rows: list[int] = np.flatnonzero(self._active & (self._failed == 0)).tolist()
@@ -466,7 +447,7 @@ class Fleet:
         self._failed[row], failures[row] = _STEP, _said(error)
         instance = self.instances[row]
         if isinstance(error, FmuEndedError) and instance is not None:
-            self._failed[row] = _ENDED
+            self._failed[row] = HAS_ENDED
             try:
                 self._get_all(instance, row)
             except FmuError as wrong:
@@ -501,14 +482,27 @@ class Fleet:
             instance = self.instances[row]
             assert instance is not None
             self._active[row] = 0
-            if code == _ENDED or (code == _DISCARDED and instance.ended()):
+            if code == HAS_ENDED or (code == DISCARDED and instance.ended()):
                 self._note(row, FmuEndedError(ENDED), found)
                 continue
-            what = "an output is not finite" if code == _NOT_FINITE else (
-                f"fmi{self.library.version}{_REASONS[code]}{instance.said()}"
-            )  # fmt: skip
-            found[row] = what
+            found[row] = self._reason(row, instance, code)
         return found
+
+    def _reason(self, row: int, instance: Instance, code: int) -> str:
+        """Why a step failed, in words."""
+        if code == NOT_FINITE:
+            return "an output is not finite"
+        try:  # what was refused is looked at once more
+            if code == NOT_OF_TYPE:
+                for group in self.setup.inputs:
+                    columns = slice(group.start, group.start + group.size)
+                    values = cells(self.inputs, group.kind, columns)[row]
+                    instance.of_type(group.kind, self._referred(group), values)
+            elif code == TOO_LARGE:
+                self._get_some(instance, row, self.setup.outputs)
+        except FmuError as error:
+            return str(error)
+        return f"fmi{self.library.version}{REASONS[code]}{instance.said()}"
 
     def take_log(self) -> Sequence[tuple[int, int, str]]:
         """What the FMU logged since this was last asked: row, status as FMI numbers it, text."""
@@ -593,18 +587,9 @@ class Fleet:
                 continue
             self.instances[row] = None
             try:
-                if self._failed[row] in (0, _ENDED):
+                if self._failed[row] in (0, HAS_ENDED):
                     instance.terminate()
             except FmuError:
                 pass  # it is freed all the same
             instance.free()
-        self._drive = None
-
-
-@cache
-def _driver() -> Any:
-    """The compiled driver; None where no compiler serves."""
-    try:
-        return toolchain.load(Path(__file__).with_name("driver.c").read_text())
-    except toolchain.CompilationError:
-        return None
+        self.drive = self._call = None

@@ -275,31 +275,52 @@ def _settable_texts(description: Any) -> dict[str, int]:
 # --------------------------------------------------------------------------------- variables
 
 
-def observed(
-    archive: Archive, name: str, *, arrays: bool, sizes: Mapping[int, int], where: str
-) -> Quantity:
-    """A local variable or parameter by its name, whole or one element; `where` names who asks.
+class Observable:
+    """Local variables and parameters by their names, whole or one element.
 
-    Raises
-    ------
-    ConfigurationError
-        If there is none of numbers.
+    Parameters
+    ----------
+    archive : Archive
+    arrays : bool
+        Whether elements form arrays.
+    sizes : mapping of int to int
+        Values of structural parameters by reference.
     """
-    wanted = ("local", "calculatedParameter", *PARAMETERS)
-    for together in (True, False) if arrays else (False,):
-        for quantity in _quantities(archive, arrays=together, sizes=sizes, wanted=wanted)[0]:
-            if quantity.name == name and quantity.kind != "String":
-                return quantity
-    known = {v.name: v for v in archive.description.modelVariables}
-    if name not in known:
+
+    def __init__(self, archive: Archive, *, arrays: bool, sizes: Mapping[int, int]) -> None:
+        self._archive, self._sizes = archive, sizes
+        self._ways = (True, False) if arrays else (False,)
+        self._read: dict[bool, dict[str, Quantity]] = {}
+
+    def find(self, name: str, where: str) -> Quantity:
+        """One of them; `where` names who asks.
+
+        Raises
+        ------
+        ConfigurationError
+            If there is none of numbers.
+        """
+        for together in self._ways:
+            if together not in self._read:
+                wanted = ("local", "calculatedParameter", *PARAMETERS)
+                found, _ = _quantities(
+                    self._archive, arrays=together, sizes=self._sizes, wanted=wanted
+                )
+                numbers = [q for q in reversed(found) if q.kind != "String"]
+                self._read[together] = {q.name: q for q in numbers}
+            if name in self._read[together]:
+                return replace(self._read[together][name])
+        known = {v.name: v for v in self._archive.description.modelVariables}
+        if name not in known:
+            raise ConfigurationError(
+                f"{where}: the FMU has no variable '{name}'\n"
+                f"  {nearest(name, known, what='it has')}"
+            )
+        variable = known[name]
         raise ConfigurationError(
-            f"{where}: the FMU has no variable '{name}'\n  {nearest(name, known, what='it has')}"
+            f"{where}: '{name}' is {variable.causality or 'local'} of type {variable.type}; it "
+            "takes local variables and parameters that are numbers"
         )
-    variable = known[name]
-    raise ConfigurationError(
-        f"{where}: '{name}' is {variable.causality or 'local'} of type {variable.type}; it takes "
-        "local variables and parameters that are numbers"
-    )
 
 
 def _quantities(
@@ -497,10 +518,11 @@ def initial_dependencies(interface: Interface) -> dict[str, set[str]]:
                 return everything  # a state, whose own start is not declared
         return found
 
-    return {
-        port: set().union(*(needs(n) for n in names if n in variables))
-        for port, names in outputs.items()
-    }
+    def of_port(names: Iterable[str]) -> set[str]:
+        found = [needs(n) for n in names if n in variables]
+        return everything if any(f is everything for f in found) else set().union(*found)
+
+    return {port: of_port(names) for port, names in outputs.items()}
 
 
 # --------------------------------------------------------------------------------- ports

@@ -17,6 +17,7 @@ from foreign import foreign
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.exchange.fmi.check.check import check_fmu
 from terrafix.cosim.exchange.fmi.run import fleet
 from terrafix.cosim.exchange.fmi.run.archive import open_archive
@@ -100,6 +101,23 @@ def test_the_rounding_of_a_member_is_not_that_of_the_next(tmp_path, libm, either
         create='i->x = !!strstr(name, "_0");',
     )
     assert flown(file, members=3).tolist() == [0.3333333333333333] * 3
+
+
+def test_the_rounding_of_an_fmu_is_not_that_of_the_next_in_a_chain(tmp_path, libm):
+    """1/3 to nearest behind an FMU that rounds upwards, in a call for both and many ticks."""
+    files = [
+        foreign(tmp_path / "up.fmu", "fesetround(FE_UPWARD); i->y = 1;"),
+        foreign(tmp_path / "third.fmu", "volatile double three = 3; i->y = i->u / three;"),
+    ]
+    made = System("s")
+    for name, file in zip("ab", files, strict=True):
+        made.add(Fmu(file=file, rate=Rate("0.1"), inputs_read="end"), name)
+    made.connect("a.y", "b.u")
+    simulation = Simulation(made)
+    simulation.run_until("5")
+    assert simulation.master.wiring.slots["b.y"].data.item() == 0.3333333333333333
+    simulation.master.terminate()
+    assert libm.fegetround() == 0
 
 
 # ------------------------------------------------------------------ forks, and what lies outside
