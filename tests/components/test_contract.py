@@ -109,6 +109,13 @@ INPUTS = {
     "dof": (4.0, 0.0),
     "accepted": (1.0, 0.0),
     "reason": (0.0, 0.0),
+    "time": (0.0, 0.0),
+    "omega_e": (np.array([0.0, 0.0, 7.292115e-5]), 1e-9),
+    "q_ei": (np.array([0.0, 0.0, 0.0, 1.0]), 0.0),
+    "sun_e": (R_E / 7e6 * 1.5e11, 1e6),
+    "sun_rate_e": (np.array([0.0, 3e4, 0.0]), 1.0),
+    "moon_e": (R_E / -7e6 * 3.8e8, 1e3),
+    "moon_rate_e": (np.array([0.0, 1e3, 0.0]), 1.0),
 }
 INERTIAL = {
     "velocity_random_walk": 1e-3,
@@ -137,6 +144,9 @@ SETTINGS = {
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "mekf_predict_smoothed": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "orbit": {"r0_i": R_E, "v0_i": [-560.1, 3729.6, 6497.9]},
+    "star_tracker": {"sun_exclusion": 0.0, "alignment_sigma": 1e-4},
+    "sun_sensor": {"bias_sigma": 1e-3, "bias_time": 10.0},
+    "horizon_sensor": {"bias_sigma": 1e-3, "bias_time": 10.0},
     "synthetic_sar_fix": {"look": 0.6},
 }
 RATES = dict.fromkeys(("last_known_state", "last_known_flight"), Rate(times=["0"]))
