@@ -171,7 +171,7 @@ class RadarAltimeter(Component):
             return down
         axis_e = np.einsum("kji,kj->ki", rotation_matrix_array(self.q_be), down)
         level = level_axes_of(self.r_e, self.setting("earth"))
-        return np.einsum("kij,kj->ki", level, axis_e)
+        return np.asarray(np.einsum("kij,kj->ki", level, axis_e))
 
     def _check_track(
         self, clearance: FloatArray, where: tuple[FloatArray, ...], dem: Dem, when: str

@@ -220,7 +220,10 @@ class RecordedOrbit(Component):
 
     def takes(self, name: str) -> bool:
         """Whether a setting has any effect on a file of this kind."""
-        played = self._path.suffix == ".nc"
+        path: Path | None = self.given_parameters.get("orbit_file")
+        if path is None:
+            return super().takes(name)
+        played = path.suffix == ".nc"
         if name == "source":
             return played
         return super().takes(name) and not (played and name in ("satellite", "interpolation_error"))

@@ -122,9 +122,11 @@ def barometer_model(earth: str = "wgs84") -> Model:
     """
     rotation_rate(earth)
     r_e, dt, time = ca.SX.sym("r_e", 3), ca.SX.sym("dt"), ca.SX.sym("time")
-    names = ("sea_level_pressure", "temperature_offset")
-    names += ("sigma", "bias_sigma", "scale_sigma", "drift")
-    p = {n: ca.SX.sym(n) for n in names}
+    day, errors = (
+        ("sea_level_pressure", "temperature_offset"),
+        ("sigma", "bias_sigma", "scale_sigma", "drift"),
+    )
+    p = {n: ca.SX.sym(n) for n in (*day, *errors)}
     bias, scale, wander = (ca.SX.sym(n) for n in ("bias", "scale", "wander"))
     streams = ("white", "bias_noise", "scale_noise", "drift_noise")
     white, n_bias, n_scale, n_drift = noise = [ca.SX.sym(n) for n in streams]
