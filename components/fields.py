@@ -259,7 +259,7 @@ DIRECTION_FIX = {
 
 GNSS_LABELS = tuple(f"{what}_{axis}" for what in "rv" for axis in XYZ)
 GNSS_FIX = {
-    "y": Field((6,), ("m",) * 3 + ("m/s",) * 3, "e", labels=GNSS_LABELS, doc="measured"),
+    "y": Field((6,), ("m",) * 3 + ("m/s",) * 3, labels=GNSS_LABELS, doc="measured, Earth-fixed"),
     "R": Field((6, 6), "1", doc="covariance of the error of y, in its units"),
     "present": Field((6,), "1", labels=GNSS_LABELS, doc="1 where an element was measured, else 0"),
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from terrafix.components.fields import GNSS_FIX
+from terrafix.components.fields import GNSS_FIX, XYZ
 from terrafix.components.noisy import NoisyComponent
 from terrafix.components.rows import Rows
 from terrafix.components.shared import require_earth
@@ -12,7 +12,7 @@ from terrafix.cosim.declare.parameters import Choice, Flag, Parameter
 from terrafix.cosim.declare.ports import Input, MessageOutput, Output
 from terrafix.models.core.model import Model
 from terrafix.models.motion.strapdown import EARTHS
-from terrafix.models.sensors.gnss import gnss_model
+from terrafix.models.sensors.gnss import TOLD, gnss_model
 
 NED = ("north", "east", "down")
 _OUTAGE = {
@@ -32,6 +32,7 @@ class Gnss(NoisyComponent):
 
     earth = Choice(EARTHS, "wgs84", doc="that of the motion")
     outages = Rows(_OUTAGE, ("start", "stop"), doc="from when to when nothing is received")
+    told = Choice(TOLD, "all", doc="covariance of all errors, or of the white noise alone")
     spoofed = Flag(False, doc="whether there is a spoofer")
     position_sigma = Parameter(
         [1.0, 1.0, 2.0], shape=(3,), unit="m", minimum=0.0, doc="white noise north, east, down"
@@ -51,7 +52,7 @@ class Gnss(NoisyComponent):
     r_e = Input((3,), unit="m", frame="e", doc="true position")
     v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
     fix = MessageOutput(fields=GNSS_FIX, doc="position and velocity")
-    bias = Output((3,), unit="m", frame="n", labels=NED, doc="true error that lasts")
+    bias = Output((3,), unit="m", frame="e", labels=XYZ, doc="true error that lasts")
     offset = Output((3,), unit="m", frame="n", labels=NED, doc="what the spoofer adds")
 
     def validate(self) -> None:
@@ -87,4 +88,5 @@ class Gnss(NoisyComponent):
     def build_model(self) -> Model:
         """Build the model for the chosen Earth, outages and spoofer."""
         outages = [(row["start"], row["stop"]) for row in self._outages]
-        return gnss_model(self.setting("earth"), outages, self.setting("spoofed"))
+        earth, spoofed, told = (self.setting(name) for name in ("earth", "spoofed", "told"))
+        return gnss_model(earth, outages, spoofed, told)

@@ -6,8 +6,9 @@ In level axes (north, east, down) the errors are
     \delta r = b + \sigma_r n_r, \qquad \delta v = \sigma_v n_v, \qquad
     b^+ = \varphi\, b + \sigma_b \sqrt{1 - \varphi^2}\, n_b, \qquad \varphi = e^{-\Delta t / \tau},
 
-of which :math:`b` are orbits, clocks and the air. The covariance told is that of both together; it
-does not say that the error of the next fix is nearly the same.
+of which :math:`b` are orbits, clocks and the air. The covariance told is that of both together,
+which does not say that the error of the next fix is nearly the same; or that of the white noise,
+for a filter that estimates the bias.
 
 A spoofer leads the receiver away from a time :math:`t_s` on: position is off by
 :math:`u\,(t - t_s)` and velocity by :math:`u`, so that both agree, and the covariance stays.
@@ -23,12 +24,18 @@ from terrafix.models.core.model import Model
 from terrafix.models.motion.strapdown import level_axes
 from terrafix.models.sensors.altimeter import wandering
 
+TOLD = ("all", "white")
+"""What the covariance of a fix holds."""
+
 _SAME = 1e-9
 """Of two times [s]: far above their rounding, far below a step."""
 
 
 def gnss_model(
-    earth: str = "wgs84", outages: Sequence[tuple[float, float]] = (), spoofed: bool = False
+    earth: str = "wgs84",
+    outages: Sequence[tuple[float, float]] = (),
+    spoofed: bool = False,
+    told: str = "all",
 ) -> Model:
     """Position and velocity, where there is a signal.
 
@@ -39,6 +46,8 @@ def gnss_model(
         From when to when nothing is received [s]; the end is received again.
     spoofed : bool
         Whether there is a spoofer.
+    told : {"all", "white"}
+        Whether the covariance is of all errors, or of the white noise alone.
 
     Returns
     -------
@@ -47,13 +56,15 @@ def gnss_model(
         ``bias_sigma`` [m], ``velocity_sigma`` [m/s], and ``bias_time`` [s]; of a spoofer
         ``spoof_from`` [s] and ``spoof_velocity_n`` [m/s]. Outputs ``fix.y``: position and velocity
         (6,) [m, m/s], their covariance ``fix.R``, ``fix.present``, ``fix.valid``, the true
-        ``bias`` in level axes [m], and ``offset``, what a spoofer adds [m].
+        ``bias`` [m], Earth-fixed, and ``offset``, what a spoofer adds in level axes [m].
 
     Raises
     ------
     ValueError
-        If the Earth is not known, or an outage ends before it begins.
+        If the Earth or what is told is not known, or an outage ends before it begins.
     """
+    if told not in TOLD:
+        raise ValueError(f"told must be one of {TOLD}, got '{told}'")
     for k, (start, stop) in enumerate(outages):
         if not stop > start:
             raise ValueError(f"outage {k + 1} is from {start:g} s to {stop:g} s")
@@ -76,7 +87,8 @@ def gnss_model(
     position = r_e + ca.mtimes(C_en, bias + p["position_sigma"] * n_r + led)
     velocity = v_e + ca.mtimes(C_en, p["velocity_sigma"] * n_v + leading)
     C = ca.diagcat(C_en, C_en)
-    variances = (p["position_sigma"] ** 2 + p["bias_sigma"] ** 2, p["velocity_sigma"] ** 2)
+    lasting = p["bias_sigma"] ** 2 if told == "all" else 0
+    variances = (p["position_sigma"] ** 2 + lasting, p["velocity_sigma"] ** 2)
     return Model(
         f"gnss_{earth}",
         inputs={"r_e": r_e, "v_e": v_e},
@@ -90,7 +102,7 @@ def gnss_model(
             "fix.R": ca.mtimes(C, ca.mtimes(ca.diag(ca.vertcat(*variances)), C.T)),
             "fix.present": ca.SX.ones(6),
             "fix.valid": ca.logic_not(lost),
-            "bias": bias,
+            "bias": ca.mtimes(C_en, bias),
             "offset": led,
         },
         step=dt,

@@ -54,7 +54,11 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     "radar_altimeter",  # in sensors/test_aircraft_sensors
     "profile_matcher",  # in images/test_profile
     "synthetic_shift",  # of apertures that end: in systems/test_aircraft
-    *("clearance_correct", "clearance_correct_radar"),  # in filters/test_clearance
+    *(
+        "clearance_correct",
+        "clearance_correct_gnss",
+        "clearance_correct_radar",
+    ),  # in filters/test_clearance
 }
 FOREIGN = {"fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
 BASES = {  # of which types are made
@@ -88,6 +92,7 @@ INPUTS = {
     "accel_bias_b": (np.zeros(3), 1e-4),
     "gyro_bias_b": (np.zeros(3), 1e-6),
     "altimeter_bias": (np.zeros(1), 1.0),
+    "gnss_bias": (np.zeros(3), 1.0),
     "range_bias": (np.zeros(1), 1.0),
     "cross_range_bias": (np.zeros(1), 1.0),
     "p_t_e": (R_E * 0.9, 100.0),
@@ -98,13 +103,13 @@ INPUTS = {
     "F": (1e-6 * np.eye(3), 0.0),
     "index": (0.0, 0.0),
     "P": (np.diag(np.append(SIGMA, [1e-2] * 15) ** 2), 0.0),
-    "y": (np.array([0.0, 0.0, 9.0e5, 7.5e3]), np.array([1e-3, 1e-3, 100.0, 1.0])),
+    "y": (np.array([0, 0, 9e5, 7.5e3, 0, 0]), np.array([1e-3, 1e-3, 100.0, 1.0, 1.0, 1.0])),
     "r_f_e": (R_E * 0.9, 100.0),
-    "R": (np.diag([0.0, 0.0, 1.0, 0.3]), 0.0),
+    "R": (np.diag([0.0, 0.0, 1.0, 0.3, 1.0, 1.0]), 0.0),
     "D": (25.0 * np.eye(3), 0.0),
-    "present": (np.ones(4), 0.0),
-    "residual": (np.zeros(4), 1.0),
-    "sigma": (np.ones(4), 0.0),
+    "present": (np.ones(6), 0.0),
+    "residual": (np.zeros(6), 1.0),
+    "sigma": (np.ones(6), 0.0),
     "nis": (4.0, 0.1),
     "dof": (4.0, 0.0),
     "accepted": (1.0, 0.0),
@@ -139,6 +144,7 @@ SETTINGS = {
         "gyro_bias_walk": 1e-8,
     },
     "inertial_predict": INERTIAL,
+    "inertial_predict_gnss": INERTIAL,
     "inertial_predict_radar": INERTIAL,
     "mekf_correct": {"look": 0.6},
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},

@@ -336,6 +336,12 @@ def test_gnss_errs_as_it_says():
         assert_chi_square(velocity[:, axis] ** 2 / b, 1)
 
 
+def test_gnss_may_tell_of_its_white_noise_alone():
+    R = received(steps=1, told="white")[0]["fix"]["R"][1, 0]
+    np.testing.assert_allclose(np.trace(R[:3, :3]), 1.0 + 1.0 + 4.0, rtol=1e-12)
+    np.testing.assert_allclose(np.trace(R[3:, 3:]), 0.0025 + 0.0025 + 0.01, rtol=1e-12)
+
+
 def test_what_lasts_of_its_errors_is_a_gauss_markov_process():
     """Allan variance of a process of sigma and T, IEEE Std 952-1997, eq. (C.17)."""
     sigma, T = 3.0, 20.0
@@ -347,7 +353,7 @@ def test_what_lasts_of_its_errors_is_a_gauss_markov_process():
         bias_time=T,
     )
     north = level(found["fix"]["y"][1:, :, :3] - r_e)[..., 0]
-    np.testing.assert_allclose(north, found["bias"][1:, :, 0], atol=1e-8)
+    np.testing.assert_allclose(north, level(found["bias"][1:])[..., 0], atol=1e-8)
     taus = np.array([5.0, 20.0, 80.0])
     measured = np.mean(
         [allantools.oadev(north[:, m], 1.0, "freq", taus)[1] ** 2 for m in range(6)], axis=0
