@@ -216,7 +216,6 @@ class RecordedOrbit(Component):
     delta_v_e = OrbitTruth.delta_v_e
 
     _epoch: str | None = None
-    _duration: float | None = None
 
     def takes(self, name: str) -> bool:
         """Whether a setting has any effect on a file of this kind."""
@@ -238,15 +237,14 @@ class RecordedOrbit(Component):
         self._read()
 
     def validate_epoch(self, epoch: str | None) -> None:
-        """Look whether the file covers an epoch, and the run from there."""
+        """Look whether the file covers the epoch of the system."""
         self._epoch = epoch
-        if self._duration is not None:
-            self._check_span()
+        if epoch is not None:
+            self._check_span(0.0)
 
     def validate_duration(self, duration: float) -> None:
-        """Read the file and look whether it covers the run."""
-        self._duration = duration
-        self._check_span()
+        """Look whether the file covers the run."""
+        self._check_span(last_step(self.rate, duration))
 
     def _read(self) -> Ephemeris | Recording:
         path = self._path
@@ -294,14 +292,12 @@ class RecordedOrbit(Component):
         except (ValueError, ImportError) as error:
             raise ConfigurationError(f"'{self.name}' cannot be at {epoch}: {error}") from error
 
-    def _check_span(self) -> None:
-        """Look whether the file covers the run, without a gap and densely enough."""
-        assert self._duration is not None
+    def _check_span(self, flown: float) -> None:
+        """Look whether the file covers a run of `flown` [s], without a gap and densely enough."""
         try:
             orbit = self._read()
         except ConfigurationError:
             return  # `validate` says so
-        flown = last_step(self.rate, self._duration)
         first = self._first(orbit, self._epoch)
         last = first + flown
         if isinstance(orbit, Recording):

@@ -1,10 +1,13 @@
 """Orbit files of others flown as truth: epochs, gaps, and how densely states must lie."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from orbit_files import FIRST, HEAD, oem, sp3, states, table
 
 from terrafix import components
+from terrafix.components.truth.playback import Recording
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.declare.component import Environment
@@ -87,7 +90,7 @@ def test_a_run_begins_at_the_epoch_of_its_system(tmp_path, monkeypatch):
     ("epoch", "settings", "message"),
     [
         ("2022-09-18T06:31:30 GPS", {}, "covers 2022-09-18T05:31:55.500 GPS to 2022-09-18T06:31:5"),
-        ("2022-09-18T05:31:50 GPS", {}, "is to play 60 s from 2022-09-18T05:31:50 GPS on"),
+        ("2022-09-18T05:31:50 GPS", {}, "is to play 0 s from 2022-09-18T05:31:50 GPS on"),
         ("2022-09-18T05:40:00 GPS", {"start": "1 s"}, "'orbit.start' is 1 s, but the run begins"),
         ("2022-09-18T05:40:00", {}, "cannot be at 2022-09-18T05:40:00: "),
         ("2022-09-18T23:59:60 UTC", {}, "there is no leap second before 2022-09-19"),
@@ -98,10 +101,19 @@ def test_an_epoch_that_cannot_be_is_refused(tmp_path, epoch, settings, message):
     path.write_text(HEAD + oem(MINUTE, scale="GPS"))
     orbit = components.recorded_orbit(orbit_file=path, rate=Rate("1"), **settings)
     orbit.name = "orbit"
-    orbit.validate_epoch(epoch)
     with pytest.raises(ConfigurationError, match=message):
+        orbit.validate_epoch(epoch)
         orbit.validate_duration(60.0)
-    orbit.validate_epoch(None)
+
+
+def test_a_recording_has_the_epoch_of_its_run():
+    """A result without one cannot be at any; with one it is as many seconds into its run."""
+    recording = Recording.__new__(Recording)
+    recording.path, recording.epoch = Path("run.nc"), "2022-09-18T05:40:00 GPS"
+    assert recording.since_start("2022-09-18T05:40:02.5 UTC") == 20.5
+    recording.epoch = None
+    with pytest.raises(ValueError, match="'run.nc' was recorded without an epoch"):
+        recording.since_start("2022-09-18T05:40:02.5 UTC")
 
 
 def test_settings_that_a_file_does_not_take_are_refused(tmp_path):
