@@ -86,6 +86,12 @@ def test_a_run_begins_at_the_epoch_of_its_system(tmp_path, monkeypatch):
     assert np.abs(found[:, 0] - r).max() < 5e-5
 
 
+def _check(orbit, epoch):
+    """As a system is checked."""
+    orbit.validate_epoch(epoch)
+    orbit.validate_duration(60.0)
+
+
 @pytest.mark.parametrize(
     ("epoch", "settings", "message"),
     [
@@ -102,8 +108,7 @@ def test_an_epoch_that_cannot_be_is_refused(tmp_path, epoch, settings, message):
     orbit = components.recorded_orbit(orbit_file=path, rate=Rate("1"), **settings)
     orbit.name = "orbit"
     with pytest.raises(ConfigurationError, match=message):
-        orbit.validate_epoch(epoch)
-        orbit.validate_duration(60.0)
+        _check(orbit, epoch)
 
 
 def test_a_recording_has_the_epoch_of_its_run():
@@ -112,7 +117,7 @@ def test_a_recording_has_the_epoch_of_its_run():
     recording.path, recording.epoch = Path("run.nc"), "2022-09-18T05:40:00 GPS"
     assert recording.since_start("2022-09-18T05:40:02.5 UTC") == 20.5
     recording.epoch = None
-    with pytest.raises(ValueError, match="'run.nc' was recorded without an epoch"):
+    with pytest.raises(ValueError, match=r"'run\.nc' was recorded without an epoch"):
         recording.since_start("2022-09-18T05:40:02.5 UTC")
 
 
