@@ -49,10 +49,10 @@ def squared(errors, covariance):
     return np.einsum("ni,ij,nj->n", errors, np.linalg.inv(covariance), errors)
 
 
-def assert_chi_square(squares, dof):
-    """The mean of n squares of `dof` degrees of freedom each."""
-    n = len(squares)
-    assert squares.mean() == pytest.approx(dof, abs=FAR * np.sqrt(2 * dof / n))
+def assert_chi_square(squares, dof, n=None):
+    """Squares of `dof` degrees of freedom each, n of them if they are sums of such."""
+    n = n or len(squares)
+    assert squares.sum() / n == pytest.approx(dof, abs=FAR * np.sqrt(2 * dof / n))
 
 
 # ------------------------------------------------------------------------ star tracker
@@ -197,7 +197,7 @@ def test_a_sun_sensor_errs_about_the_sun_as_it_says():
     np.testing.assert_allclose(np.linalg.norm(y, axis=-1), 1.0, atol=1e-14)
     off = (y - u)[..., [0, 2]]
     white = off - off.mean(axis=0)
-    assert_chi_square((white**2).sum(axis=(0, 2)) / 1e-6 / 39, 2)  # of 39: sharper than it asks
+    assert_chi_square((white**2).sum(axis=(0, 2)) / 1e-6, 2, n=400 * 39)
     total = (off.mean(axis=0) ** 2).sum(axis=1) / (4e-6 + 1e-6 / 40)
     assert_chi_square(total, 2)
     R = fix["R"][1, 0]
@@ -231,6 +231,17 @@ def test_a_sun_sensor_sees_the_sun_in_its_field_and_out_of_the_shadow(sun, lit, 
     made = components.sun_sensor(boresight_b=[0.0, 1.0, 0.0])
     found = tf.testing.drive(made, inputs, 1)
     assert (found["lit"][1, 0], found["fix"].fresh[1, 0]) == (lit, fresh)
+
+
+def test_the_sun_moves_on_between_publications():
+    """Published at -10 s; at t = 10 s it has moved for 20 s in axes that have turned for 20 s."""
+    around = AROUND | {"time": -10.0, "omega_e": [0, 0, 1e-3], "sun_rate_e": [1e8, 0, 2e8]}
+    inputs = {"r_e": LEO, "q_be": IDENTITY, "surroundings": around}
+    made = components.sun_sensor(boresight_b=[0.0, 1.0, 0.0], sigma=0.0)
+    y = tf.testing.drive(made, inputs, 10)["fix"]["y"][10, 0]
+    moved = np.array([20e8, SUN, 40e8])
+    sun = Rotation.from_rotvec([0, 0, -0.02]).apply(moved) - LEO
+    np.testing.assert_allclose(y, sun / np.linalg.norm(sun), atol=1e-14)
 
 
 @pytest.mark.parametrize(("tilt", "fresh"), [(59.9, True), (60.1, False)])
@@ -287,7 +298,7 @@ def test_a_barometer_errs_as_it_says():
     made = components.barometer(earth="flat", sigma=5.0, bias_sigma=30.0, scale_sigma=1e-3)
     found = tf.testing.drive(made, {"r_e": [0.0, 0.0, -1000.0]}, 20, members=2000, seed=2)
     p, fix = found["pressure"][1:], found["fix"]
-    assert_chi_square(((p - p.mean(axis=0)) ** 2).sum(axis=0) / 25.0 / 19, 1)
+    assert_chi_square(((p - p.mean(axis=0)) ** 2).sum(axis=0) / 25.0, 1, n=2000 * 19)
     off = (p[0] - 89876.28) ** 2 / (25.0 + 900.0 + 89.876**2)
     assert_chi_square(off, 1)
     height = fix["y"][1, :, 0] - 1000.0
