@@ -498,6 +498,27 @@ def test_a_radar_altimeter_with_a_beam_is_flown(bank, valid):
         assert_chi_square(((fix["y"][1:, 0, 0] - 800.0) / 5.0) ** 2, 1)
 
 
+@pytest.mark.parametrize("bank", [30.0, -30.0])
+def test_a_bank_to_the_right_looks_to_the_left(bank):
+    """Northward, ground that rises to the east by 0.3: c cos(s) / cos(s - a) at the edge a.
+
+    Right wing down, body z points west and down: the nearest is 20 deg off, downhill. Left wing
+    down, 20 to 40 deg uphill: the perpendicular, 16.7 deg off, is not in the beam, 20 deg is.
+    """
+    dem = slope_dem(0.3)
+    grid = [dem.latitude0, dem.longitude0, dem.latitude_step, dem.longitude_step, 0.0]
+    made = RadarAltimeter(
+        earth="flat", pointing="body", half_angle="10 deg", sigma=1e-6, rate=Rate("1")
+    )
+    made.prepare()
+    q_be = from_rotation_vector_array([np.radians(bank), 0.0, 0.0])
+    east = np.ascontiguousarray(dem.height.T)
+    inputs = {"r_e": [0.0, 0.0, -1000.0], "q_be": q_be, "height": east, "grid": grid}
+    y = tf.testing.drive(made, inputs, 1)["fix"]["y"][1, 0, 0]
+    s, a = np.arctan(0.3), np.radians(-20.0 if bank > 0 else 20.0)
+    assert y == pytest.approx(1000 * np.cos(s) / np.cos(s - a), abs=1.0)
+
+
 def test_a_beam_that_is_fixed_to_the_body_has_a_width():
     made = RadarAltimeter(pointing="body")
     with pytest.raises(ConfigurationError, match="its beam has no width"):
