@@ -233,6 +233,38 @@ HEIGHT_FIX = {
 }
 """What an altimeter measures."""
 
+ENVIRONMENT = {
+    "time": Field((), "s", doc="that the rest holds for"),
+    "omega_e": Field((3,), "rad/s", "e", labels=XYZ, doc="rotation of the Earth-fixed axes"),
+    "q_ei": Field((4,), "1", "e", doc="inertial (GCRF) to Earth-fixed (ITRF)"),
+    "sun_e": Field((3,), "m", "e", labels=XYZ, doc="Sun, from the Earth's center"),
+    "sun_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
+    "moon_e": Field((3,), "m", "e", labels=XYZ, doc="Moon, from the Earth's center"),
+    "moon_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
+}
+"""What surrounds a satellite, at the time of publication; turned inside models until the next."""
+
+STAR_FIX = {
+    "q_bi": Field((4,), "1", "b", doc="measured attitude, inertial to body"),
+    "R": Field((3, 3), "rad^2", "b", doc="covariance of its rotation error, in body axes"),
+    "taken": Field((), "s", doc="when the stars were seen"),
+}
+"""What a star tracker measures."""
+
+DIRECTION_FIX = {
+    "y": Field((3,), "1", "b", labels=XYZ, doc="measured direction, of unit length"),
+    "R": Field((3, 3), "1", "b", doc="its covariance, of rank two"),
+}
+"""What a sensor of a direction measures."""
+
+GNSS_LABELS = tuple(f"{what}_{axis}" for what in "rv" for axis in XYZ)
+GNSS_FIX = {
+    "y": Field((6,), ("m",) * 3 + ("m/s",) * 3, labels=GNSS_LABELS, doc="measured, Earth-fixed"),
+    "R": Field((6, 6), "1", doc="covariance of the error of y, in its units"),
+    "present": Field((6,), "1", labels=GNSS_LABELS, doc="1 where an element was measured, else 0"),
+}
+"""Position and velocity that a receiver measures."""
+
 CLEARANCE_FIX = {
     "y": Field((1,), "m", labels=("clearance",), doc="measured"),
     "R": HEIGHT_FIX["R"],

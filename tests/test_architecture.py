@@ -19,7 +19,8 @@ WINGS = {
 }
 """Folder of each wing; the last holds the import name and the command line."""
 ORDER = [
-    *("models.core", "models.geometry", "models.motion", "models.maps", "models.sensors"),
+    *("models.core", "models.geometry", "models.motion", "models.motion.orbits"),
+    *("models.maps", "models.sensors"),
     *("models.radar", "models.images", "models.filters", "models"),
     *("cosim.basics", "cosim.show", "cosim.memory", "cosim.declare", "cosim.kernels"),
     *("cosim.system", "cosim.files", "cosim.records", "cosim.engine", "cosim.lincov"),

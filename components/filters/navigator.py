@@ -20,8 +20,10 @@ from terrafix.models.filters.measurement import Observation
 from terrafix.models.filters.navigator import (
     DECAYS,
     DRIFTING,
+    LOCATED,
     NAVIGATOR,
     altimeter_observation,
+    gnss_observation,
     navigator_process,
     shift_observation,
 )
@@ -102,6 +104,16 @@ class RadarInertialPredict(InertialPredict):
     cross_range_bias_time = _time(100.0)
 
 
+class LocatedInertialPredict(InertialPredict):
+    """The same with what lasts of the error of a GNSS receiver's positions; without a radar."""
+
+    error_state, process = LOCATED, navigator_process(LOCATED, "wgs84")
+    sigmas = {n: s for n, s in _SIGMAS.items() if n in LOCATED.places}  # noqa: RUF012
+
+    gnss_bias_sigma = _sigma(1.5)
+    gnss_bias_time = _time(300.0)
+
+
 class _OnEarth(FilterCorrect):
     """Correction on an Earth that is chosen: base."""
 
@@ -128,6 +140,23 @@ class RadarAltimeterCorrect(AltimeterCorrect):
     """The same of a navigator with a radar."""
 
     error_state = NAVIGATOR
+
+
+class LocatedAltimeterCorrect(AltimeterCorrect):
+    """The same of a navigator with a GNSS receiver."""
+
+    error_state = LOCATED
+
+
+class GnssCorrect(FilterCorrect):
+    """Correction by the position and velocity of a GNSS receiver.
+
+    What lasts of its error is a state: the receiver tells the covariance of its white noise
+    (`told = "white"`).
+    """
+
+    default_rate = Rate("1", offset="1")
+    error_state, observation = LOCATED, gnss_observation()
 
 
 class ShiftCorrect(_OnEarth):
@@ -168,6 +197,12 @@ class RadarClearanceCorrect(ClearanceCorrect):
     """The same of a navigator with a radar."""
 
     error_state, observation = NAVIGATOR, clearance_observation(NAVIGATOR, "wgs84")
+
+
+class LocatedClearanceCorrect(ClearanceCorrect):
+    """The same of a navigator with a GNSS receiver."""
+
+    error_state, observation = LOCATED, clearance_observation(LOCATED, "wgs84")
 
 
 class PlaceCorrect(_OnEarth):

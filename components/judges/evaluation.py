@@ -14,8 +14,10 @@ from terrafix.models.filters.error_state import Values
 from terrafix.models.filters.lake import CONSIDERED, ORBIT, lake_observation
 from terrafix.models.filters.navigator import (
     DRIFTING,
+    LOCATED,
     NAVIGATOR,
     altimeter_observation,
+    gnss_observation,
     shift_observation,
 )
 from terrafix.models.filters.shore import shore_observation
@@ -91,6 +93,17 @@ class ContourEvaluation(InertialEvaluation):
         **InertialEvaluation.observations,
         "profile": place_observation("wgs84"),
         "contour": clearance_observation(DRIFTING, "wgs84"),
+    }
+
+
+class LocatedEvaluation(InertialEvaluation):
+    """The same of a navigator with a GNSS receiver, and where contours are matched, too."""
+
+    error_state = LOCATED
+    observations = {  # noqa: RUF012
+        **InertialEvaluation.observations,
+        "gnss": gnss_observation(),
+        "contour": clearance_observation(LOCATED, "wgs84"),
     }
 
 

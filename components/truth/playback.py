@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,7 +24,9 @@ from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.parameters import FilePath, Parameter, Text
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import inertial_from_earth_fixed_array
-from terrafix.models.motion.ephemeris import Ephemeris, read_eof
+from terrafix.models.motion.ephemeris import Ephemeris
+from terrafix.models.motion.epochs import instant
+from terrafix.models.motion.orbits.files import read_orbit
 
 CLOSE = 1e-9  # [s] within which two times are the same: far below any step, far above rounding
 
@@ -71,6 +74,7 @@ class Recording:
                 f"'{component.name}' cannot play its recording: {error}\n"
                 "  record the original in an earlier run, and name the result it was written to"
             ) from error
+        self.epoch: str | None = dataset.attrs.get("epoch")
         self.members: NDArray[np.int64] = dataset["member"].to_numpy()
         self.samples: dict[str, tuple[FloatArray, FloatArray]] = {}
         for name in (*names, *optional):
@@ -118,6 +122,19 @@ class Recording:
                     f"'{self.path.name}' ends at {times[-1]:g} s\n"
                     "  fly shorter (--duration), or record the original longer"
                 )
+
+    def since_start(self, epoch: str) -> float:
+        """Seconds from the start of the recording to an epoch.
+
+        Raises
+        ------
+        ValueError
+            If the recording has no epoch.
+        """
+        if not self.epoch:
+            raise ValueError(f"'{self.path.name}' was recorded without an epoch")
+        (day, seconds), (first, begin) = instant(epoch), instant(self.epoch)
+        return (day - first) * 86400.0 + (seconds - begin)
 
     def choose(self, members: NDArray[np.int64]) -> None:
         """Keep the members that are flown; the only one of a recording serves all."""
@@ -171,18 +188,23 @@ def last_step(rate: Rate | None, duration: float) -> float:
 class RecordedOrbit(Component):
     """A satellite's real or earlier orbit, on the ports of `orbit`.
 
-    From a Sentinel-1 orbit file (.EOF), whose states every 10 s are interpolated by cubic Hermite
-    polynomials, or from a result of terrafix (.nc), played sample by sample. What a file does not
+    From an orbit file of others (OEM, SP3-c, SP3-d, EOF, table), whose states are interpolated to
+    the eighth order, or from a result of terrafix (.nc), played sample by sample. A run begins at
+    the system's epoch, or where it has none `start` after the first state. What a file does not
     hold is supplied: `delta_v_e` is zero, and inertial axes are the Earth-fixed ones of t = 0
     turned by `earth_angle0`.
     """
 
     default_rate = Rate(hz=100)
 
-    orbit_file = FilePath(doc="orbit file (.EOF) or result (.nc)")
+    orbit_file = FilePath(doc="orbit file (OEM, SP3, .EOF, .csv) or result (.nc)")
     source = Text("orbit", doc="path of the component whose outputs are played (.nc)")
+    satellite = Text("", doc="which, in a file of several (OEM, SP3)")
     start = Parameter(
-        0.0, unit="s", minimum=0.0, doc="t = 0, after the first state (.EOF) or start (.nc)"
+        0.0, unit="s", minimum=0.0, doc="t = 0, after the first state or start (without an epoch)"
+    )
+    interpolation_error = Parameter(
+        1.0, unit="m", positive=True, doc="of positions, up to which states may lie apart"
     )
     rotation_rate = Parameter(EARTH.rotation_rate, unit="rad/s", doc="Earth rotation")
     earth_angle0 = Parameter(0.0, unit="rad", doc="inertial to Earth-fixed x axis at t = 0")
@@ -193,12 +215,39 @@ class RecordedOrbit(Component):
     v_e = OrbitTruth.v_e
     delta_v_e = OrbitTruth.delta_v_e
 
+    _epoch: str | None = None
+
+    def takes(self, name: str) -> bool:
+        """Whether a setting has any effect on a file of this kind."""
+        path: Path | None = self.given_parameters.get("orbit_file")
+        if path is None:
+            return super().takes(name)
+        played = path.suffix == ".nc"
+        if name == "source":
+            return played
+        return super().takes(name) and not (played and name in ("satellite", "interpolation_error"))
+
+    @property
+    def _path(self) -> Path:
+        path: Path = self.setting("orbit_file")
+        return path
+
     def validate(self) -> None:
         """Read the file."""
         self._read()
 
+    def validate_epoch(self, epoch: str | None) -> None:
+        """Look whether the file covers the epoch of the system."""
+        self._epoch = epoch
+        if epoch is not None:
+            self._check_span(0.0)
+
+    def validate_duration(self, duration: float) -> None:
+        """Look whether the file covers the run."""
+        self._check_span(last_step(self.rate, duration))
+
     def _read(self) -> Ephemeris | Recording:
-        path: Path = self.setting("orbit_file")
+        path = self._path
         hint = f"set {self.name}.orbit_file, or TERRAFIX_DATA to the folder with the data"
         if not path.is_file():
             what = "is a folder" if path.is_dir() else "is not there"
@@ -212,28 +261,76 @@ class RecordedOrbit(Component):
             recording.check_times(start, self.rate)
             return recording
         try:
-            ephemeris = read_eof(path)
-        except (OSError, ValueError) as error:
+            stat = path.stat()
+            stamp = (stat.st_mtime_ns, stat.st_size)
+            ephemeris = _read_once(path, stamp, self.setting("satellite"))
+        except (OSError, ValueError, ImportError) as error:
             raise ConfigurationError(
                 f"'{self.name}' cannot read its orbit file: {error}\n  {hint}"
             ) from error
         if start >= ephemeris.t[-1]:
             raise ConfigurationError(
                 f"'{self.name}.start' is {start:g} s, but '{path.name}' covers "
-                f"{ephemeris.t[-1]:g} s from {ephemeris.utc[0]} UTC"
+                f"{ephemeris.t[-1]:g} s from {ephemeris.tags[0]} {ephemeris.scale}"
             )
         return ephemeris
 
-    def validate_duration(self, duration: float) -> None:
-        """Read the file and look whether it covers the run."""
-        orbit, last = self._read(), float(self.setting("start")) + last_step(self.rate, duration)
+    def _first(self, orbit: Ephemeris | Recording, epoch: str | None) -> float:
+        """Time of the file at t = 0 [s]: of the epoch, or `start`."""
+        start = float(self.setting("start"))
+        if epoch is None:
+            return start
+        if start:
+            raise ConfigurationError(
+                f"'{self.name}.start' is {start:g} s, but the run begins at the system's epoch, "
+                f"{epoch}\n  leave one of them"
+            )
+        try:
+            if isinstance(orbit, Recording):
+                return orbit.since_start(epoch)
+            return orbit.since_first(*instant(epoch))
+        except (ValueError, ImportError) as error:
+            raise ConfigurationError(f"'{self.name}' cannot be at {epoch}: {error}") from error
+
+    def _check_span(self, flown: float) -> None:
+        """Look whether the file covers a run of `flown` [s], without a gap and densely enough."""
+        try:
+            orbit = self._read()
+        except ConfigurationError:
+            return  # `validate` says so
+        first = self._first(orbit, self._epoch)
+        last = first + flown
         if isinstance(orbit, Recording):
+            orbit.check_times(first, self.rate)
             orbit.check_end(last)
-        elif last > orbit.t[-1]:
+            return
+        name = self._path.name
+        if self._epoch is not None and not 0.0 <= first <= last <= orbit.t[-1]:
+            raise ConfigurationError(
+                f"'{self.name}' is to play {flown:g} s from {self._epoch} on, but '{name}' covers "
+                f"{orbit.tag(0.0)} to {orbit.tag(float(orbit.t[-1]))}\n"
+                "  set another epoch, fly shorter (--duration), or use another file"
+            )
+        if last > orbit.t[-1]:
             raise ConfigurationError(
                 f"'{self.name}' is to play until {last:g} s after the first state of "
-                f"'{self.setting('orbit_file').name}', which covers {orbit.t[-1]:g} s\n"
+                f"'{name}', which covers {orbit.t[-1]:g} s\n"
                 f"  fly shorter (--duration), or set an earlier {self.name}.start"
+            )
+        gap = orbit.gap_within(first, last)
+        if gap is not None:
+            raise ConfigurationError(
+                f"'{self.name}' is to play from {first:g} s to {last:g} s after the first state of "
+                f"'{name}', which has none between {gap[0]:g} s and {gap[1]:g} s "
+                f"({orbit.tag(gap[0])} to {orbit.tag(gap[1])})\n"
+                "  fly before or after that gap, or use another file"
+            )
+        error, most = orbit.error(first, last), float(self.setting("interpolation_error"))
+        if error > most:
+            raise ConfigurationError(
+                f"'{self.name}' interpolates the states of '{name}' to {error:.2g} m, and "
+                f"{self.name}.interpolation_error is {most:g} m\n"
+                "  use a file with states closer to each other, or with velocities, or allow more"
             )
 
     def bind(self, environment: Environment) -> None:
@@ -253,6 +350,9 @@ class RecordedOrbit(Component):
                     "from one time\n  disperse it with an orbit file, which is interpolated"
                 )
             alike = alike and len(self._orbit.members) == 1
+        epoch = getattr(self.environment, "epoch", None)
+        since = 0.0 if epoch is None else self._first(self._orbit, epoch)
+        self._begin = self.start + since
         # compute once for all members unless they differ
         self._who = slice(0, 1) if alike else slice(None)
         self._publish(0.0)
@@ -263,14 +363,10 @@ class RecordedOrbit(Component):
     def _publish(self, t: float) -> None:
         held: Mapping[str, Any] = {}
         if isinstance(self._orbit, Recording):
-            self._orbit.publish(float(self.start[0]) + t)
+            self._orbit.publish(float(self._begin[0]) + t)
             held = self._orbit.samples
         else:
-            wanted, known = self.start[self._who] + t, self._orbit.t
-            outside = (wanted < known[0]) | (wanted > known[-1])
-            if outside.any():
-                self.fail(np.broadcast_to(outside, self.n_members), _UNCOVERED)
-            self.r_e, self.v_e = self._orbit.at(np.clip(wanted, known[0], known[-1]))
+            self._interpolate(self._orbit, self._begin[self._who] + t)
         if "r_i" not in held or "v_i" not in held:
             rate = self.rotation_rate[self._who]
             angle = self.earth_angle0[self._who] + rate * t
@@ -278,6 +374,20 @@ class RecordedOrbit(Component):
             self.r_i, self.v_i = inertial_from_earth_fixed_array(r_e, v_e, angle, rate)
         if "delta_v_e" not in held:
             self.delta_v_e = 0.0
+
+    def _interpolate(self, orbit: Ephemeris, wanted: FloatArray) -> None:
+        """Publish states at times of the file [s], of all members or one for all."""
+        uncovered = ~orbit.covers(wanted)
+        if uncovered.any():
+            self.fail(np.broadcast_to(uncovered, self.n_members), _UNCOVERED)
+            wanted = np.where(uncovered, orbit.t[np.argmax(orbit.known)], wanted)
+        self.r_e, self.v_e = orbit.at(wanted)
+
+
+@lru_cache(maxsize=2)
+def _read_once(path: Path, _stamp: tuple[int, ...], satellite: str) -> Ephemeris:
+    """An orbit file as it was at its time stamp and size, read once for check and start."""
+    return read_orbit(path, satellite)
 
 
 class Playback(Component):

@@ -47,6 +47,9 @@ APERTURE = "aperture"
 DRIFTING = ErrorState(*INERTIAL, vector("altimeter_bias", 1, unit="m"))
 """What an aircraft without a radar estimates."""
 
+LOCATED = ErrorState(*DRIFTING, vector("gnss_bias", 3, unit="m", frame="e"))
+"""What an aircraft with a GNSS receiver estimates: what lasts of the error of its positions."""
+
 NAVIGATOR = ErrorState(
     *DRIFTING,
     vector("range_bias", 1, unit="m"),
@@ -59,6 +62,7 @@ DECAYS = {
     "accel_bias_b": ("accel_bias_time", "accel_bias_sigma"),
     "gyro_bias_b": ("gyro_bias_time", "gyro_bias_sigma"),
     "altimeter_bias": ("altimeter_bias_time", "altimeter_bias_sigma"),
+    "gnss_bias": ("gnss_bias_time", "gnss_bias_sigma"),
     "range_bias": ("range_bias_time", "range_bias_sigma"),
     "cross_range_bias": ("cross_range_bias_time", "cross_range_bias_sigma"),
 }
@@ -71,7 +75,7 @@ def navigator_process(state: ErrorState, earth: str) -> Process:
     Parameters
     ----------
     state : ErrorState
-        `DRIFTING` or `NAVIGATOR`.
+        `DRIFTING`, `LOCATED` or `NAVIGATOR`.
     earth : {"wgs84", "flat"}
 
     Raises
@@ -90,6 +94,12 @@ def altimeter_observation(earth: str) -> Observation:
     return Observation(
         lambda x, _: height_of(x["r_e"], earth) + x["altimeter_bias"], {"height": "m"}
     )
+
+
+def gnss_observation() -> Observation:
+    """Position, with a bias that is estimated, and velocity, Earth-fixed."""
+    units = {f"{what}_{axis}": unit for what, unit in (("r", "m"), ("v", "m/s")) for axis in "xyz"}
+    return Observation(lambda x, _: ca.vertcat(x["r_e"] + x["gnss_bias"], x["v_e"]), units)
 
 
 def shift_observation(earth: str) -> Observation:

@@ -1,16 +1,26 @@
-"""Recorded orbits: Sentinel-1 orbit files (.EOF), and the state between their epochs.
+r"""Ephemerides: states of a satellite at epochs, and the state between them.
 
-Seconds are counted in atomic time (TAI), which every state of such a file is tagged with: between
-two UTC tags lies one more where a leap second was inserted.
+Seconds are counted in atomic time (TAI): between two UTC tags lies one more where a leap second
+was inserted.
 
-Position between two epochs is the cubic that takes position and velocity at both (Hermite); the
-velocity is its derivative. The error of position grows with the fourth power of the spacing: at
-the 10 s of an orbit file it is a fraction of a millimeter in a low Earth orbit.
+Between two epochs position is the polynomial of degree seven, order eight, that takes the
+neighborhood's positions: those of eight epochs, or, where velocities are known, positions and
+velocities of four (Hermite). Velocity is its derivative. For circular motion of radius :math:`r`
+and rate :math:`n` the error of position in the middle of an interval :math:`h`, away from the
+ends, is
+
+.. math::
+    \frac{9}{16} \frac{9}{16} \frac{r (n h)^8}{8!} \;\text{(Hermite)}, \qquad
+    \left(\frac{105}{16}\right)^2 \frac{r (n h)^8}{8!} \;\text{(positions alone)}.
+
+`Ephemeris.error` estimates it for the states that are there. Nothing is interpolated across a gap,
+an interval several times longer than those about it, nor between two parts of a file.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -20,13 +30,19 @@ from numpy.typing import ArrayLike, NDArray
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.formats import kind_of
 from terrafix.models.geometry.earth import EARTH
+from terrafix.models.motion.epochs import atomic, day_and_seconds
 
 MAX_BYTES = 64 * 1024 * 1024
 """Largest orbit file read; a day of state vectors every 10 s takes 5 MB."""
+GAP = 2.5
+"""An interval is a gap that is longer than this times the median of those about it."""
 
 _FIELDS = {"X": "m", "Y": "m", "Z": "m", "VX": "m/s", "VY": "m/s", "VZ": "m/s"}
 _LEAP = ":60"
 """How the tag of a leap second ends, before its fraction."""
+_NEIGHBORS = 4
+"""Intervals on each side that one is compared with."""
+_ORDER = 8
 
 
 @dataclass(frozen=True)
@@ -35,14 +51,21 @@ class Ephemeris:
 
     Parameters
     ----------
-    utc : ndarray of datetime64[ns], shape (n_epochs,)
-        Epochs, UTC; within a leap second, the tag of the second after it.
+    tags : ndarray of datetime64[ns], shape (n_epochs,)
+        Epochs as they are tagged; within a leap second, the tag of the second after it.
     t : ndarray, shape (n_epochs,)
         Epochs in seconds since the first.
     r_e : ndarray, shape (n_epochs, 3)
         Position [m], Earth-fixed.
-    v_e : ndarray, shape (n_epochs, 3)
+    v_e : ndarray, shape (n_epochs, 3), optional
         Velocity relative to the rotating Earth [m/s], Earth-fixed.
+    scale : str
+        Time scale of the tags: "UTC", "GPS", "TAI" or "TT".
+    tai0 : datetime64[ns], optional
+        TAI of the first epoch, where it is known.
+    ends : sequence of int
+        Numbers of the states with which parts of a file end: what follows is not joined. The next
+        part may begin at the same epoch, from which on it holds.
 
     Raises
     ------
@@ -51,27 +74,95 @@ class Ephemeris:
         not finite.
     """
 
-    utc: NDArray[np.datetime64]
+    tags: NDArray[np.datetime64]
     t: FloatArray
     r_e: FloatArray
-    v_e: FloatArray
+    v_e: FloatArray | None = None
+    scale: str = "UTC"
+    tai0: np.datetime64 | None = None
+    ends: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.t)
-        shapes = (self.utc.shape, self.t.shape, self.r_e.shape, self.v_e.shape)
+        speeds = np.zeros((n, 3)) if self.v_e is None else self.v_e
+        shapes = (self.tags.shape, self.t.shape, self.r_e.shape, speeds.shape)
         if shapes != ((n,), (n,), (n, 3), (n, 3)):
             raise ValueError(
                 f"an ephemeris wants shapes (n,), (n,), (n, 3) and (n, 3), got {shapes}"
             )
         if n < 2:
             raise ValueError(f"an ephemeris wants two epochs at least, got {n}")
-        if not np.all(np.diff(self.t) > 0):
-            k = int(np.argmin(np.diff(self.t) > 0))
+        later = np.diff(self.t) > 0
+        touching = [k for k in self.ends if k < n - 1 and self.t[k + 1] == self.t[k]]
+        later[touching] = True
+        if not later.all():
+            k = int(np.argmin(later))
+            if self.t[k + 1] == self.t[k]:
+                raise ValueError(f"the epochs number {k} and {k + 1} are the same: {self.tags[k]}")
             raise ValueError(f"the epochs do not increase from number {k} to {k + 1}")
-        for name, states in (("position", self.r_e), ("velocity", self.v_e)):
+        for name, states in (("position", self.r_e), ("velocity", speeds)):
             bad = ~np.isfinite(states).all(axis=1)
             if bad.any():
                 raise ValueError(f"the {name} at epoch {int(np.argmax(bad))} is not finite")
+
+    # ------------------------------------------------------------------ what is covered
+
+    @cached_property
+    def _torn(self) -> NDArray[np.bool_]:
+        """Which intervals are not interpolated, (n - 1,)."""
+        h = np.diff(self.t)
+        padded = np.pad(h, _NEIGHBORS, constant_values=np.nan)
+        about = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBORS + 1)
+        torn = np.asarray(h > GAP * np.nanmedian(about, axis=1))
+        torn[[k for k in self.ends if k < len(torn)]] = True
+        return torn
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which intervals between epochs are interpolated, (n_epochs - 1,)."""
+        return ~self._torn
+
+    @property
+    def gaps(self) -> list[tuple[float, float]]:
+        """Begin and end [s] of each interval of which nothing is known."""
+        torn = self._torn & (np.diff(self.t) > 0)
+        return [(float(self.t[k]), float(self.t[k + 1])) for k in np.flatnonzero(torn)]
+
+    def gap_within(self, first: float, last: float) -> tuple[float, float] | None:
+        """The first gap that a span of time [s] meets."""
+        return next((gap for gap in self.gaps if gap[0] < last and gap[1] > first), None)
+
+    def covers(self, t: ArrayLike) -> NDArray[np.bool_]:
+        """Whether states are known at times [s], (...)."""
+        t = np.asarray(t, np.float64)
+        inside = (t >= self.t[0]) & (t <= self.t[-1])
+        return np.asarray(inside & ~self._torn[self._interval(np.where(inside, t, self.t[0]))])
+
+    def tag(self, t: float) -> str:
+        """A time [s] as the file would tag it, to the millisecond."""
+        k = int(np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 1))
+        tagged = self.tags[k] + np.timedelta64(round((t - self.t[k]) * 1e3), "ms")
+        return f"{tagged.astype('datetime64[ms]')} {self.scale}"
+
+    def first_tai(self) -> np.datetime64:
+        """TAI of the first epoch.
+
+        Raises
+        ------
+        ModuleNotFoundError
+            If it is tagged in UTC alone, and pyerfa is not installed.
+        """
+        if self.tai0 is not None:
+            return self.tai0
+        tai0: np.datetime64 = atomic(self.tags[:1], np.zeros(1, np.bool_), self.scale)[0]
+        return tai0
+
+    def since_first(self, day: int, seconds: float) -> float:
+        """Seconds from the first epoch to an instant: modified Julian day of TAI, seconds of it."""
+        first_day, first_seconds = day_and_seconds(self.first_tai())
+        return (day - first_day) * 86400.0 + (seconds - first_seconds)
+
+    # ------------------------------------------------------------------ interpolation
 
     def at(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Interpolate position [m] and velocity [m/s], two (..., 3), at times (...).
@@ -84,7 +175,7 @@ class Ephemeris:
         Raises
         ------
         ValueError
-            If a time is outside the epochs, or not a number.
+            If a time is outside the epochs, in a gap between them, or not a number.
         """
         t = np.asarray(t, dtype=np.float64)
         outside = ~((t >= self.t[0]) & (t <= self.t[-1]))
@@ -92,17 +183,110 @@ class Ephemeris:
             first = t[outside].flat[0]
             raise ValueError(
                 f"cannot extrapolate to {first} s: the ephemeris covers {self.t[0]} s to "
-                f"{self.t[-1]} s after {self.utc[0]} UTC"
+                f"{self.t[-1]} s after {self.tags[0]} {self.scale}"
             )
+        k = self._interval(t)
+        if self._torn[k].any():
+            lost = np.atleast_1d(k)[np.atleast_1d(self._torn[k])][0]
+            raise ValueError(
+                f"no states are known between {self.t[lost]} s and {self.t[lost + 1]} s after "
+                f"{self.tags[0]} {self.scale}"
+            )
+        return self._evaluated(self._polynomials, k, t)
+
+    def _interval(self, t: FloatArray) -> NDArray[np.intp]:
+        """Interval of each time; where one begins that is not known, the one that ends there."""
         k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
-        h = (self.t[k + 1] - self.t[k])[..., None]
-        s = (t - self.t[k])[..., None] / h
-        r0, r1, v0, v1 = self.r_e[k], self.r_e[k + 1], self.v_e[k], self.v_e[k + 1]
-        chord = (r1 - r0) / h
-        # r = r0 + h s (v0 + s (c2 + s c3)): small terms added to r0 keep its last bits
-        c2, c3 = 3 * chord - 2 * v0 - v1, v0 + v1 - 2 * chord
-        r = r0 + h * s * (v0 + s * (c2 + s * c3))
-        return r, v0 + s * (2 * c2 + 3 * s * c3)
+        return np.asarray(k - (self._torn[k] & (t == self.t[k]) & (k > 0)))
+
+    def _evaluated(
+        self, polynomials: tuple[FloatArray, FloatArray], k: NDArray[np.intp], t: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        coefficients, width = polynomials
+        degree = np.arange(1.0, coefficients.shape[1] + 1)
+        s = ((t - self.t[k]) / width[k])[..., None]
+        powers = s ** (degree - 1)
+        c = coefficients[k]
+        # what is added to the state before it is small: its last bits are kept
+        r = self.r_e[k] + np.einsum("...p,...pi->...i", powers * s, c)
+        return r, np.einsum("...p,...pi->...i", powers * degree, c) / width[k][..., None]
+
+    @cached_property
+    def _polynomials(self) -> tuple[FloatArray, FloatArray]:
+        return self._fitted(_ORDER)
+
+    @cached_property
+    def _errors(self) -> FloatArray:
+        """Estimated error of positions in the middle of each interval [m]; zero where torn."""
+        k = np.flatnonzero(self.known)
+        middle = (self.t[k] + self.t[k + 1]) / 2
+        first, last = self._parts
+        few = (last - first + 1)[k].min(initial=len(self.t)) < self._nodes(_ORDER + 2)
+        other = self._fitted(_ORDER - 2 if few else _ORDER + 2)
+        one, two = (self._evaluated(p, k, middle)[0] for p in (self._polynomials, other))
+        errors = np.zeros(len(self.t) - 1)
+        errors[k] = np.linalg.norm(one - two, axis=1)
+        return errors
+
+    def error(self, first: float = -np.inf, last: float = np.inf) -> float:
+        """Largest error of interpolated positions in a span of time [m], estimated.
+
+        The difference to two orders up in the middle of each interval. What the states themselves
+        err by from one to the next counts, too; where they are too few for that order, it is the
+        difference to two orders down, an upper bound.
+        """
+        within = (self.t[:-1] < last) & (self.t[1:] > first)
+        return float(self._errors[within].max(initial=0.0))
+
+    @cached_property
+    def _parts(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """First and last state of the part that each interval lies in."""
+        borders = np.flatnonzero(self._torn)
+        first = np.concatenate([[0], borders + 1])
+        last = np.concatenate([borders, [len(self.t) - 1]])
+        part = np.searchsorted(borders, np.arange(len(self.t) - 1))
+        return first[part], last[part]
+
+    def _nodes(self, order: int) -> int:
+        return order if self.v_e is None else order // 2
+
+    def _fitted(self, order: int) -> tuple[FloatArray, FloatArray]:
+        """Polynomials of an order through the states about each interval.
+
+        Returns
+        -------
+        coefficients : ndarray, shape (n - 1, order - 1, 3)
+            Of the powers from the first on of the time since the state before, in widths [m].
+        width : ndarray, shape (n - 1,)
+            [s]
+        """
+        first, last = self._parts
+        known = np.minimum(self._nodes(order), last - first + 1)
+        coefficients = np.zeros((len(known), order - 1, 3))
+        width = np.ones(len(known))
+        for m in np.unique(known[~self._torn]):
+            k = np.flatnonzero((known == m) & ~self._torn)
+            start = np.clip(k - (m - 2) // 2, first[k], last[k] - m + 1)
+            solved, width[k] = self._through(k, start[:, None] + np.arange(m))
+            coefficients[k, : solved.shape[1]] = solved
+        return coefficients, width
+
+    def _through(
+        self, k: NDArray[np.intp], window: NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Polynomials through the states (n, m) of a window about intervals (n,)."""
+        m = window.shape[1]
+        since = self.t[window] - self.t[k][:, None]
+        width = np.abs(since).max(axis=1)
+        others = since != 0.0
+        x, alike = np.unique(since / width[:, None], axis=0, return_inverse=True)
+        degree = np.arange(1.0, (m if self.v_e is None else 2 * m))
+        rows = (x[..., None] ** degree)[x != 0.0].reshape(len(x), m - 1, -1)
+        known = (self.r_e[window] - self.r_e[k][:, None])[others].reshape(len(k), m - 1, 3)
+        if self.v_e is not None:
+            rows = np.concatenate([rows, degree * x[..., None] ** (degree - 1)], axis=1)
+            known = np.concatenate([known, self.v_e[window] * width[:, None, None]], axis=1)
+        return np.linalg.inv(rows)[alike.ravel()] @ known, width
 
 
 def read_eof(path: str | Path) -> Ephemeris:
@@ -166,7 +350,8 @@ def read_eof(path: str | Path) -> Ephemeris:
             "positions are in meters"
         )
     try:
-        return Ephemeris(utc, t, states[:, :3].copy(), states[:, 3:].copy())
+        tai0 = _epochs(path, vectors[:1], "TAI")[0] if any(atomic) else None
+        return Ephemeris(utc, t, states[:, :3].copy(), states[:, 3:].copy(), tai0=tai0)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

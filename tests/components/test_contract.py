@@ -54,7 +54,11 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     "radar_altimeter",  # in sensors/test_aircraft_sensors
     "profile_matcher",  # in images/test_profile
     "synthetic_shift",  # of apertures that end: in systems/test_aircraft
-    *("clearance_correct", "clearance_correct_radar"),  # in filters/test_clearance
+    *(
+        "clearance_correct",
+        "clearance_correct_gnss",
+        "clearance_correct_radar",
+    ),  # in filters/test_clearance
 }
 FOREIGN = {"fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
 BASES = {  # of which types are made
@@ -88,6 +92,7 @@ INPUTS = {
     "accel_bias_b": (np.zeros(3), 1e-4),
     "gyro_bias_b": (np.zeros(3), 1e-6),
     "altimeter_bias": (np.zeros(1), 1.0),
+    "gnss_bias": (np.zeros(3), 1.0),
     "range_bias": (np.zeros(1), 1.0),
     "cross_range_bias": (np.zeros(1), 1.0),
     "p_t_e": (R_E * 0.9, 100.0),
@@ -98,17 +103,24 @@ INPUTS = {
     "F": (1e-6 * np.eye(3), 0.0),
     "index": (0.0, 0.0),
     "P": (np.diag(np.append(SIGMA, [1e-2] * 15) ** 2), 0.0),
-    "y": (np.array([0.0, 0.0, 9.0e5, 7.5e3]), np.array([1e-3, 1e-3, 100.0, 1.0])),
+    "y": (np.array([0, 0, 9e5, 7.5e3, 0, 0]), np.array([1e-3, 1e-3, 100.0, 1.0, 1.0, 1.0])),
     "r_f_e": (R_E * 0.9, 100.0),
-    "R": (np.diag([0.0, 0.0, 1.0, 0.3]), 0.0),
+    "R": (np.diag([0.0, 0.0, 1.0, 0.3, 1.0, 1.0]), 0.0),
     "D": (25.0 * np.eye(3), 0.0),
-    "present": (np.ones(4), 0.0),
-    "residual": (np.zeros(4), 1.0),
-    "sigma": (np.ones(4), 0.0),
+    "present": (np.ones(6), 0.0),
+    "residual": (np.zeros(6), 1.0),
+    "sigma": (np.ones(6), 0.0),
     "nis": (4.0, 0.1),
     "dof": (4.0, 0.0),
     "accepted": (1.0, 0.0),
     "reason": (0.0, 0.0),
+    "time": (0.0, 0.0),
+    "omega_e": (np.array([0.0, 0.0, 7.292115e-5]), 1e-9),
+    "q_ei": (np.array([0.0, 0.0, 0.0, 1.0]), 0.0),
+    "sun_e": (R_E / 7e6 * 1.5e11, 1e6),
+    "sun_rate_e": (np.array([0.0, 3e4, 0.0]), 1.0),
+    "moon_e": (R_E / -7e6 * 3.8e8, 1e3),
+    "moon_rate_e": (np.array([0.0, 1e3, 0.0]), 1.0),
 }
 INERTIAL = {
     "velocity_random_walk": 1e-3,
@@ -132,12 +144,16 @@ SETTINGS = {
         "gyro_bias_walk": 1e-8,
     },
     "inertial_predict": INERTIAL,
+    "inertial_predict_gnss": INERTIAL,
     "inertial_predict_radar": INERTIAL,
     "mekf_correct": {"look": 0.6},
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "mekf_predict_smoothed": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "orbit": {"r0_i": R_E, "v0_i": [-560.1, 3729.6, 6497.9]},
     "orbit_start": {"frame": "gcrf", "r0": R_E, "v0": [-560.1, 3729.6, 6497.9]},
+    "star_tracker": {"sun_exclusion": 0.0, "alignment_sigma": 1e-4},
+    "sun_sensor": {"bias_sigma": 1e-3, "bias_time": 10.0},
+    "horizon_sensor": {"bias_sigma": 1e-3, "bias_time": 10.0},
     "synthetic_sar_fix": {"look": 0.6},
 }
 RATES = dict.fromkeys(("last_known_state", "last_known_flight", "orbit_start"), Rate(times=["0"]))

@@ -30,6 +30,7 @@ SHORT, FEW = "17", 2  # [s], two fixes; members
 SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
     **dict.fromkeys(("leo_lake", "leo_lake_printed", "leo_lake_shore"), "0.3"),  # nine fixes
     "leo_lake_image": "1",
+    "gps_lost": "125",  # until GPS is
     "aircraft_gotcha": "1",
     "aircraft_sar": "0.4",
     "leo_lakes_orbit": "3",
