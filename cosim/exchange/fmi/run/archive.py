@@ -117,9 +117,9 @@ def unpack(file: Path, folder: Path, what: str = "FMU") -> None:
             _refuse_unsafe(file, members)
             written = 0
             for member in members:
-                if member.is_dir():
+                if member.filename.endswith(("/", "\\")):
                     continue
-                target = folder / PurePosixPath(member.filename)
+                target = folder / _path(member)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(member) as source, target.open("wb") as sink:
                     while chunk := source.read(1 << 20):
@@ -136,6 +136,11 @@ def unpack(file: Path, folder: Path, what: str = "FMU") -> None:
         raise ConfigurationError(f"cannot unpack '{file}': {error}") from error
 
 
+def _path(member: zipfile.ZipInfo) -> PurePosixPath:
+    """Where a file belongs; tools on Windows write backslashes."""
+    return PurePosixPath(member.filename.replace("\\", "/"))
+
+
 def _refuse_unsafe(file: Path, members: list[zipfile.ZipInfo]) -> None:
     if len(members) > MOST_FILES:
         raise _unsafe(file, f"it holds {len(members)} files")
@@ -143,7 +148,7 @@ def _refuse_unsafe(file: Path, members: list[zipfile.ZipInfo]) -> None:
     if total > MOST_BYTES:
         raise _unsafe(file, f"it unpacks to {total / 2**30:.1f} GiB")
     for member in members:
-        name = PurePosixPath(member.filename.replace("\\", "/"))
+        name = _path(member)
         outside = name.is_absolute() or ".." in name.parts or ":" in member.filename
         if outside:
             raise _unsafe(file, f"it would write outside its folder, to '{member.filename}'")

@@ -166,13 +166,7 @@ class Interface:
 
         Discrete inputs are set and clocks tick there. Without them an FMU handles events itself.
         """
-        interface = self.archive.description.coSimulation
-        if self.kind != CO_SIMULATION or not getattr(interface, "hasEventMode", False):
-            return False
-        return any(
-            v.type == "Clock" or (v.causality == "input" and v.variability == "discrete")
-            for v in self.archive.description.modelVariables
-        )
+        return uses_event_mode(self.archive, self.kind)
 
     @property
     def input_clocks(self) -> list[str]:
@@ -193,6 +187,17 @@ class Interface:
             for p in self.ports
         ]
         return replace(self, ports=ports)
+
+
+def uses_event_mode(archive: Archive, kind: str) -> bool:
+    """Whether an FMU has event mode in co-simulation (FMI 3), and a use for it."""
+    interface = archive.description.coSimulation
+    if kind != CO_SIMULATION or not getattr(interface, "hasEventMode", False):
+        return False
+    return any(
+        v.type == "Clock" or (v.causality == "input" and v.variability == "discrete")
+        for v in archive.description.modelVariables
+    )
 
 
 def read_interface(
