@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import stat
 import zipfile
 import zlib
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,6 +21,8 @@ from terrafix.cosim.exchange.fmi.run.platforms import host_platform
 MOST_BYTES = 4 << 30
 MOST_FILES = 20_000
 MOST_XML = 256 << 20
+MOST_ELEMENTS = 1 << 27
+"""Of one array: a gibibyte of numbers."""
 
 
 @dataclass
@@ -117,7 +121,7 @@ def unpack(file: Path, folder: Path, what: str = "FMU") -> None:
             _refuse_unsafe(file, members)
             written = 0
             for member in members:
-                if member.filename.endswith(("/", "\\")):
+                if _is_folder(member):
                     continue
                 target = folder / _path(member)
                 target.parent.mkdir(parents=True, exist_ok=True)
@@ -141,9 +145,20 @@ def _path(member: zipfile.ZipInfo) -> PurePosixPath:
     return PurePosixPath(member.filename.replace("\\", "/"))
 
 
+def _is_folder(member: zipfile.ZipInfo) -> bool:
+    return member.filename.endswith(("/", "\\"))
+
+
 def _refuse_unsafe(file: Path, members: list[zipfile.ZipInfo]) -> None:
     if len(members) > MOST_FILES:
         raise _unsafe(file, f"it holds {len(members)} files")
+    files = {(_path(m), m.CRC, m.file_size) for m in members if not _is_folder(m)}
+    twice = [str(name) for name, n in Counter(name for name, *_ in files).items() if n > 1]
+    if twice:
+        raise _unsafe(
+            file,
+            f"it holds '{twice[0]}' twice, differently, and readers differ in which one counts",
+        )
     total = sum(m.file_size for m in members)
     if total > MOST_BYTES:
         raise _unsafe(file, f"it unpacks to {total / 2**30:.1f} GiB")
@@ -193,6 +208,23 @@ def _check_identifier(identifier: str, tag: str, file: Path) -> None:
         )
 
 
+def _check_variables(description: Any, file: Path) -> None:
+    """References are numbers of 32 bits, and arrays have sizes."""
+    for variable in description.modelVariables:
+        reference = int(variable.valueReference)
+        if not 0 <= reference < 1 << 32:
+            raise ConfigurationError(
+                f"'{file}': the valueReference of '{variable.name}' is {reference}; FMI demands 0 "
+                "to 4294967295\n  ask for another from the tool that wrote it"
+            )
+        shape = [int(n) for n in variable.shape or ()]
+        if min(shape, default=0) < 0 or math.prod(shape) > MOST_ELEMENTS:
+            raise ConfigurationError(
+                f"'{file}': '{variable.name}' is an array of {' x '.join(map(str, shape))}; "
+                f"terrafix holds up to {MOST_ELEMENTS} numbers of one variable"
+            )
+
+
 def _bound_unsigned(root: Any, description: Any) -> None:
     """Read the bounds of unsigned integers, which FMPy leaves out."""
     variables = {v.name: v for v in description.modelVariables if v.type.startswith("UInt")}
@@ -233,6 +265,7 @@ def _read(file: Path, folder: Path) -> Archive:
     for tag in ("CoSimulation", "ModelExchange", "ScheduledExecution"):
         for each in root.iter(tag):
             _check_identifier(each.get("modelIdentifier", ""), tag, file)
+    _check_variables(description, file)
     _bound_unsigned(root, description)
     directional = any(
         each.get(name) in ("true", "1")
