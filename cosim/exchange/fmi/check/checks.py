@@ -394,11 +394,8 @@ def check_step_size(subject: Subject, case: str) -> Iterator[Finding]:
 
 def check_derivatives(subject: Subject) -> Iterator[Finding]:
     """Directional derivatives against central differences."""
-    interface = subject.interface
-    if not (
-        getattr(interface, "providesDirectionalDerivative", False)
-        or getattr(interface, "providesDirectionalDerivatives", False)
-    ):
+    element = "CoSimulation" if subject.kind == CO_SIMULATION else "ModelExchange"
+    if element not in subject.archive.directional:
         yield Finding("derivatives", NOTE, "providesDirectionalDerivatives", "it has none")
         return
     if subject.kind == MODEL_EXCHANGE:

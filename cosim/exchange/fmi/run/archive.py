@@ -37,8 +37,8 @@ class Archive:
         Where it was unpacked; removed when this process ends.
     description : fmpy.model_description.ModelDescription
     version : {2, 3}
-    directional : bool
-        Whether it says that it has directional derivatives.
+    directional : frozenset of str
+        Elements of the interfaces that say that they have directional derivatives.
     annotation : Element or None
         What terrafix wrote about the ports of an FMU of its own.
     """
@@ -47,7 +47,7 @@ class Archive:
     folder: Path
     description: Any
     version: int
-    directional: bool = False
+    directional: frozenset[str] = frozenset()
     annotation: Any = field(default=None, repr=False)
 
     def binary(self, identifier: str) -> Path:
@@ -267,11 +267,12 @@ def _read(file: Path, folder: Path) -> Archive:
             _check_identifier(each.get("modelIdentifier", ""), tag, file)
     _check_variables(description, file)
     _bound_unsigned(root, description)
-    directional = any(
-        each.get(name) in ("true", "1")
+    directional = frozenset(
+        tag
         for tag in ("CoSimulation", "ModelExchange")
         for each in root.iter(tag)
         for name in ("providesDirectionalDerivatives", "providesDirectionalDerivative")
+        if each.get(name) in ("true", "1")
     )
     annotation = next(root.iter("Interface"), None)
     return Archive(file, folder, description, int(version[0]), directional, annotation)
