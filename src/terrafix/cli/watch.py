@@ -17,10 +17,14 @@ if TYPE_CHECKING:
 _CRASHES = ("SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT", "SIGSYS", "SIGTRAP")
 
 
-def watch_foreign_code(system: System) -> None:
+_KEPT = "with isolate = true it has one of its own, and the run keeps its records"
+
+
+def watch_foreign_code(system: System, kept: str = _KEPT) -> None:
     """Go on in a copy of this process, if FMUs run in it, and wait for its end here.
 
-    The copy ends with this process. This one leaves with the status of the copy.
+    The copy ends with this process. This one leaves with the status of the copy. `kept` says what
+    is left where the FMU ends it, and what to do.
 
     Raises
     ------
@@ -65,8 +69,7 @@ def watch_foreign_code(system: System) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     how = f"crashed it (signal {-status})" if status < 0 else f"ended it (exit status {status})"
     raise StepError(
-        f"{' or '.join(named)}, which runs in the process of the simulation, {how}\n"
-        "  with isolate = true it has one of its own, and the run keeps its records"
+        f"{' or '.join(named)}, which runs in the process of the simulation, {how}\n  {kept}"
     )
 
 
