@@ -14,7 +14,8 @@ from terrafix.cosim.basics.errors import StepError
 if TYPE_CHECKING:
     from terrafix.cosim.system.system import System
 
-_CRASHES = ("SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT", "SIGSYS", "SIGTRAP")
+_PASSED_ON = ("SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT")
+"""Signals by which somebody ends a run; any other is told."""
 
 
 _KEPT = "with isolate = true it has one of its own, and the run keeps its records"
@@ -62,8 +63,8 @@ def watch_foreign_code(system: System, kept: str = _KEPT) -> None:
         orderly = False
     if status >= 0 and orderly:
         sys.exit(status)
-    crashes = [getattr(signal, name) for name in _CRASHES if hasattr(signal, name)]
-    if status < 0 and -status not in crashes:
+    passed_on = [getattr(signal, name) for name in _PASSED_ON if hasattr(signal, name)]
+    if status < 0 and -status in passed_on:
         signal.signal(-status, signal.SIG_DFL)
         os.kill(os.getpid(), -status)
     signal.signal(signal.SIGINT, signal.default_int_handler)
