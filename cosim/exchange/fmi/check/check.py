@@ -227,7 +227,8 @@ def _same_twice(path: str | Path, kind: str) -> bool:
             return True  # as far as it can be told
         finally:
             worker.close()
-    return np.array_equal(*samples, equal_nan=True)
+    first, second = samples
+    return bool(np.array_equal(first, second, equal_nan=True))
 
 
 def _fresh(path: str | Path, kind: str) -> Worker:
