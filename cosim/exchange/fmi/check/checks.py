@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -530,6 +530,9 @@ def _derivatives_of_steps(subject: Subject) -> Iterator[Finding]:
                 ]
                 if all(wrong):  # the standard says neither "at once" nor "through a step"
                     yield from wrong[0]
+                elif not np.any(instant):
+                    for each in wrong[0]:
+                        yield replace(each, severity=NOTE, why="right at once, not for the step")
         instance.free_state(before)
         if hidden:
             yield Finding("derivatives", NOTE, ", ".join(dict.fromkeys(hidden)), "differences over "

@@ -331,7 +331,7 @@ def test_derivatives_at_once_and_through_a_step_are_both_right(tmp_path, slope, 
         tmp_path / "a.fmu", 2, [U, Variable("y", start="1.0")], step="m->r[1] += h * m->r[0];",
         globals_=f"#define OFF 0\n#define SLOPE {slope}\n{STATE}", interface=ABLE,
     )  # fmt: skip
-    assert (said_by(file, "derivatives") == []) == right
+    assert (not [s for s, _ in said_by(file, "derivatives") if s != NOTE]) == right
 
 
 @pytest.mark.parametrize(("off", "severity"), [("1e-6", WARNING), ("1e-2", ERROR)])
