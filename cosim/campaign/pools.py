@@ -49,7 +49,8 @@ def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown
     """Fly batches in processes of their own."""
     waiting = list(batches)[::-1]
     lost: dict[Batch, int] = {}
-    alone = b"__main__" not in pickle.dumps(task)
+    sent = pickle.dumps(task)
+    alone = b"__main__" not in sent
     while waiting:
         context = _Spawning()
         pool = ProcessPoolExecutor(workers, context, initializer=_begin_worker)
@@ -59,20 +60,39 @@ def in_processes(task: Task, batches: Sequence[Batch], *, workers: int) -> Flown
                 while waiting and len(running) < workers + 1:
                     batch = waiting.pop()
                     with _without_main(hidden=alone):  # this is when processes are started
-                        running[pool.submit(fly_batch, task, *batch)] = batch
+                        running[pool.submit(_fly_sent, sent, *batch)] = batch
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     yield future.result()
                     del running[future]
         except BrokenProcessPool:
             again = list(running.values())
             for batch in again:
-                _count_loss(lost, batch)
+                _count_loss(lost, batch, _ends(context.started))
             waiting += again[::-1]
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in context.started:
                 if process.is_alive():
                     process.terminate()
+
+
+def _fly_sent(sent: bytes, first: int, last: int) -> list[BlockResult]:
+    """Fly a batch of a task that is read here, where it can be said what is missing."""
+    try:
+        task = pickle.loads(sent)
+    except Exception as error:
+        raise ConfigurationError(
+            f"a process of the campaign cannot read the system: {type(error).__name__}: {error}\n"
+            "  put what it names into a module that can be imported, or give workers=1"
+        ) from None
+    return fly_batch(task, first, last)
+
+
+def _ends(processes: Sequence[SpawnProcess]) -> list[int]:
+    """How processes of a broken pool ended: exit statuses, without those that the pool ended."""
+    for process in processes:
+        process.join(timeout=1.0)
+    return [p.exitcode for p in processes if p.exitcode not in (None, -signal.SIGTERM)]
 
 
 class _Spawning(SpawnContext):
@@ -115,14 +135,30 @@ def _follow(parent: Any) -> None:
     os._exit(1)
 
 
-def _count_loss(lost: dict[Batch, int], batch: Batch) -> None:
+def _count_loss(lost: dict[Batch, int], batch: Batch, ends: Sequence[int] = ()) -> None:
     lost[batch] = lost.get(batch, 0) + 1
     if lost[batch] > MOST_LOSSES:
         raise StepError(
             f"the worker that flew members {batch[0]} to {batch[1] - 1} was lost "
-            f"{lost[batch]} times\n  it may need more memory than there is: give fewer workers; in "
-            "a script that\n  defines components, fly below `if __name__ == '__main__':`"
+            f"{lost[batch]} times{_why(ends)}"
         )
+
+
+def _why(ends: Sequence[int]) -> str:
+    """How a worker ended, and what to try."""
+    killed = -getattr(signal, "SIGKILL", 9)
+    if not ends or killed in ends:
+        said = f": it was killed (signal {-killed})" if ends else ""
+        return f"{said}\n  it may need more memory than there is: give fewer workers"
+    crashed = f"it crashed (signal {-ends[0]})"
+    ended = f"it ended itself (exit status {ends[0]})"
+    text = (
+        f": {crashed if ends[0] < 0 else ended}\n  code that is no Python does that: an FMU, say, "
+        "which has a process of its own with isolate = true"
+    )
+    if ends[0] == 1:
+        text += "; in a script that\n  defines components, fly below `if __name__ == '__main__':`"
+    return text
 
 
 @contextmanager

@@ -50,8 +50,9 @@ class Wires:
                 self.symbolic[path] = component
             elif component is not self.evaluation and not _given(component):
                 raise ConfigurationError(
-                    f"'{path}' ({type(component).__name__}) has no symbolic Jacobian, so the "
-                    "system cannot be linearized\n  fly a campaign instead"
+                    f"'{path}' ({type(component).__name__}) has no symbolic Jacobian, as all that "
+                    "can only be stepped (FMUs, components in Python), so the system cannot be "
+                    "linearized\n  fly a campaign instead, which takes its dispersions"
                 )
 
     def source(self, path: str, name: str) -> tuple[Key, FloatArray | None] | None:

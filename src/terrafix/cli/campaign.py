@@ -20,6 +20,7 @@ from terrafix.cli.options import (
     target_of,
 )
 from terrafix.cli.output import print_json, show
+from terrafix.cli.watch import watch_foreign_code
 from terrafix.cosim.basics.errors import ConfigurationError
 
 
@@ -64,6 +65,13 @@ def campaign(
             "--dask and --workers both say who flies the campaign\n  give one of them"
         )
     runs = _runs(runs, out, resume=resume)
+    if dask is None:
+        kept = "is not kept: give --out DIR" if out is None else f"is kept in {out}: give --resume"
+        watch_foreign_code(
+            read(system, settings),
+            "with isolate = true it has one of its own, and costs no more than the members that it "
+            f"fails\n  what was done until then {kept}",
+        )
     if member is not None:
         return _one_member(
             system, settings, member, runs, seed=seed, duration=duration, out=out, as_json=as_json

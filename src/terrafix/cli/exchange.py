@@ -70,14 +70,20 @@ def _named(what: str) -> tuple[str, str | None]:
 
 @click.command("check-fmu")
 @click.argument("file", metavar="FILE.fmu")
+@click.option("--page", metavar="FILE.html", help="Write a page of what was found.")
 @json_option
-def check_fmu_command(file: str, as_json: bool) -> int:
+def check_fmu_command(file: str, page: str | None, as_json: bool) -> int:
     """Check anybody's FMU: its description, its binaries, and what they do."""
     from terrafix.cli.progress import ProgressBar, stderr_is_terminal
     from terrafix.cosim.exchange.fmi.check.check import check_fmu
+    from terrafix.cosim.exchange.fmi.check.page import write_page
 
+    if page is not None:
+        writable_target(page, (".html", ".htm"))
     with ProgressBar(shown=stderr_is_terminal(), first="checking") as progress:
         report = check_fmu(file, progress=progress)
+    if page is not None:
+        print(f"wrote {write_page(report, page)}", file=sys.stderr)
     if as_json:
         print_json(report.summary())
     else:

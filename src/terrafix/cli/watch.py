@@ -14,13 +14,18 @@ from terrafix.cosim.basics.errors import StepError
 if TYPE_CHECKING:
     from terrafix.cosim.system.system import System
 
-_CRASHES = ("SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT", "SIGSYS", "SIGTRAP")
+_PASSED_ON = ("SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT")
+"""Signals by which somebody ends a run; any other is told."""
 
 
-def watch_foreign_code(system: System) -> None:
+_KEPT = "with isolate = true it has one of its own, and the run keeps its records"
+
+
+def watch_foreign_code(system: System, kept: str = _KEPT) -> None:
     """Go on in a copy of this process, if FMUs run in it, and wait for its end here.
 
-    The copy ends with this process. This one leaves with the status of the copy.
+    The copy ends with this process. This one leaves with the status of the copy. `kept` says what
+    is left where the FMU ends it, and what to do.
 
     Raises
     ------
@@ -58,15 +63,14 @@ def watch_foreign_code(system: System) -> None:
         orderly = False
     if status >= 0 and orderly:
         sys.exit(status)
-    crashes = [getattr(signal, name) for name in _CRASHES if hasattr(signal, name)]
-    if status < 0 and -status not in crashes:
+    passed_on = [getattr(signal, name) for name in _PASSED_ON if hasattr(signal, name)]
+    if status < 0 and -status in passed_on:
         signal.signal(-status, signal.SIG_DFL)
         os.kill(os.getpid(), -status)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     how = f"crashed it (signal {-status})" if status < 0 else f"ended it (exit status {status})"
     raise StepError(
-        f"{' or '.join(named)}, which runs in the process of the simulation, {how}\n"
-        "  with isolate = true it has one of its own, and the run keeps its records"
+        f"{' or '.join(named)}, which runs in the process of the simulation, {how}\n  {kept}"
     )
 
 

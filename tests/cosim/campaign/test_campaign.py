@@ -11,16 +11,19 @@ import time
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 import xarray as xr
-from campaign_parts import Judge, scalar_system
+from campaign_parts import Judge, Tripwire, scalar_system
 from click.testing import CliRunner
+from foreign import foreign
 
 from terrafix.cli import main
 from terrafix.cosim.basics.errors import CheckpointError, ConfigurationError, SystemCheckError
 from terrafix.cosim.campaign import campaign as module
+from terrafix.cosim.campaign import pools
 from terrafix.cosim.campaign.batch import FileSource
 from terrafix.cosim.campaign.campaign import CampaignError, run_campaign
 from terrafix.cosim.engine.run import simulate
@@ -611,3 +614,52 @@ def test_bad_input_is_one_message_and_status_2(arguments, text, monkeypatch):
     assert (status, out) == (2, ""), err
     assert text in err
     assert "Traceback" not in err
+
+
+# ------------------------------------------------------------------ what ends its process
+
+
+FOREIGN = '\n[component.foreign]\ntype = "fmu"\nfile = "foreign.fmu"\nrate = "1 Hz"\n'
+
+
+def test_an_fmu_that_ends_the_process_is_named_and_what_is_done_is_kept(folder):
+    """It ends it in the second batch; the eight blocks of the first are there."""
+    steps = 'if (++steps > 512L * 20) { fprintf(stderr, "foreign ends it\\n"); _exit(7); }'
+    foreign(folder / "foreign.fmu", steps, globals_="static long steps;")
+    (folder / "scalar.toml").write_text(SYSTEM + FOREIGN)
+    words = ("campaign", "scalar.toml", "--runs", "600", "--workers", "1", "--out", "c", "--quiet")
+    flying = started(*words)
+    _, err = flying.communicate(timeout=120)
+    assert flying.returncode == 1, err
+    assert "'foreign', which runs in the process of the simulation, ended it (exit status 7)" in err
+    assert "what was done until then is kept in c: give --resume" in err
+    assert len(list((folder / "c" / "blocks").glob("*.npz"))) == 8
+
+
+def test_a_worker_that_ends_says_how(folder, monkeypatch):
+    monkeypatch.setattr(pools, "MOST_LOSSES", 0)
+    foreign(folder / "foreign.fmu", "if (t > 10) _exit(7);")
+    (folder / "scalar.toml").write_text(SYSTEM + FOREIGN)
+    with pytest.raises(CampaignError) as raised:
+        run_campaign("scalar.toml", runs=128, workers=2, batch=64)
+    assert "lost 1 times: it ended itself (exit status 7)" in str(raised.value)
+    assert "isolate = true" in str(raised.value)
+    assert "memory" not in str(raised.value)
+    assert "killed (signal 9)\n  it may need more memory" in pools._why([-9, -15, 1])
+    assert "crashed (signal 11)" in pools._why([-11])
+
+
+def test_a_worker_that_cannot_import_a_class_says_which(monkeypatch):
+    """Its module is known to this process alone."""
+    nowhere = ModuleType("nowhere")
+    nowhere.Own = type("Own", (Tripwire,), {"__module__": "nowhere"})
+    monkeypatch.setitem(sys.modules, "nowhere", nowhere)
+    system = scalar_system()
+    with system:
+        system.add(nowhere.Own(), "own")
+    system.connect("filter.truth", "own.u")
+    with pytest.raises(ConfigurationError) as raised:
+        fly(system, runs=128, workers=2, batch=64)
+    assert "cannot read the system: ModuleNotFoundError: No module named 'nowhere'" in str(
+        raised.value
+    )

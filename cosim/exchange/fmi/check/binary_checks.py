@@ -45,11 +45,15 @@ def exported(binary: Any) -> set[str]:
     names = {str(s.name) for s in binary.exported_symbols}
     if isinstance(binary, lief.MachO.Binary):
         if not names:  # older linkers write no list of exports, only the table of symbols
-            undefined = lief.MachO.Symbol.TYPE.UNDEFINED
-            named = (s for s in binary.symbols if s.is_external and s.type != undefined)
-            names = {str(s.name) for s in named}
+            names = {str(s.name) for s in binary.symbols if _is_shown(s.raw_type)}
         names = {n.removeprefix("_") for n in names}
     return names - _OF_LINKERS
+
+
+def _is_shown(kind: int) -> bool:
+    """Whether a symbol of a Mach-O is defined and external, by the bits of its ``n_type``."""
+    debugging_or_private, defined, external = 0xF0, 0x0E, 0x01
+    return not kind & debugging_or_private and bool(kind & defined) and bool(kind & external)
 
 
 def required(binary: Any) -> set[str]:
@@ -91,31 +95,47 @@ def check_binaries(archive: Archive) -> Iterator[Finding]:
             "an importer must compile it" if sources else "nothing can run it",
         )  # fmt: skip
         return
+    wanted = identifiers(archive)
     for platform in platforms:
-        for file in sorted(platform.iterdir()):
-            if file.suffix in (".so", ".dll", ".dylib"):
-                yield from _check_binary(archive, platform.name, file)
+        files = [p for p in sorted(platform.iterdir()) if p.suffix in (".so", ".dll", ".dylib")]
+        for file in files:
+            yield from _check_binary(archive, platform.name, file, main=file.stem in wanted)
+        same = str.lower if any(f.suffix == ".dll" for f in files) else str  # as Windows has it
+        found = {same(f.stem) for f in files}
+        for name in sorted(n for n in wanted if same(n) not in found) if files else ():
+            have = ", ".join(f.name for f in files)
+            yield Finding(
+                "library", ERROR, f"binaries/{platform.name}",
+                f"it has no '{name}', which is a modelIdentifier of the description, but {have}",
+                "no importer finds the binary",
+            )  # fmt: skip
     names = ", ".join(p.name for p in platforms)
     if len(platforms) == 1:
         yield Finding("library", NOTE, "binaries", f"there is a binary for {names} alone")
 
 
-def _check_binary(archive: Archive, platform: str, file: Path) -> Iterator[Finding]:
+def identifiers(archive: Archive) -> set[str]:
+    """What the binaries of the FMU are called."""
+    description = archive.description
+    names = ("coSimulation", "modelExchange", "scheduledExecution")
+    offered = (getattr(description, name, None) for name in names)
+    return {str(each.modelIdentifier) for each in offered if each is not None}
+
+
+def _check_binary(archive: Archive, platform: str, file: Path, *, main: bool) -> Iterator[Finding]:
     where = f"binaries/{platform}/{file.name}"
     binary = parse(file)
     if binary is None:
         yield Finding("library", ERROR, where, "it is no binary", "it cannot be loaded")
         return
     names = exported(binary)
-    prefix = f"fmi{archive.version}"
-    shown = {n for n in names if n.startswith(prefix)}
-    foreign = names - shown
-    if not shown:
+    foreign = {n for n in names if not n.startswith(("fmi2", "fmi3"))}
+    if main and names == foreign:
         yield Finding(
             "library", ERROR, where, f"it exports no function of FMI {archive.version}",
             "no importer can call it",
         )  # fmt: skip
-    if foreign:
+    if foreign and main:
         few = ", ".join(sorted(foreign)[:4]) + (", ..." if len(foreign) > 4 else "")
         yield Finding(
             "library", WARNING, where, f"it shows {len(foreign)} symbols besides FMI's: {few}",

@@ -6,15 +6,19 @@ the next check gets a new process.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
 from terrafix.cosim.exchange.fmi.check.binary_checks import check_binaries
+from terrafix.cosim.exchange.fmi.check.checks import NOT_MADE
 from terrafix.cosim.exchange.fmi.check.findings import ERROR, NOTE, WARNING, Finding
-from terrafix.cosim.exchange.fmi.run.archive import is_c_name, open_archive
+from terrafix.cosim.exchange.fmi.run.archive import Archive, is_c_name, open_archive
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
 from terrafix.cosim.exchange.fmi.run.remote import FIRST_LIMIT, ProcessError, Worker
 
@@ -32,8 +36,17 @@ CALLING = (
 """Checks that call the binary, as `terrafix.cosim.exchange.fmi.check.checks` has them."""
 LIMIT = 120.0
 """Longest time of one check [s]."""
-WRONG_STEPS = ("negative", "NaN", "fraction")
-"""Steps that no master may ask for; an FMU need not answer."""
+WRONG_STEPS = ("negative", "zero", "NaN", "fraction", "past")
+"""Steps that no master may ask for; an FMU need not answer, save that past the stop time."""
+_WRONG = {
+    "negative": "a negative step",
+    "zero": "a step of zero",
+    "NaN": "a step of NaN",
+    "fraction": "a fraction of its step",
+    "past": "a step past the stop time",
+}
+_REPEATED = ("state", "reset", "instances", "derivatives", "dependencies")
+"""Checks that mean something if the FMU is twice the same."""
 WRONG_STEP_LIMIT = 5.0
 
 
@@ -120,7 +133,7 @@ def check_fmu(
     kinds = [kind for kind, interface in offered.items() if interface is not None]
     report = Report(Path(path), archive.version, description.modelName or "", tuple(kinds))
     report.checks.append("description")
-    for problem in _validated(path):
+    for problem in _validated(archive):
         report.add(
             Finding(
                 "description", ERROR, "modelDescription.xml", problem,
@@ -147,23 +160,31 @@ def check_fmu(
                 "besides, its description and its binaries are",
             )
         )  # fmt: skip
+    kinds = [kind for kind in kinds if _has_binary(archive, kind, report)]
     calls = [(kind, name) for kind in kinds for name in CALLING]
+    given_up: set[str] = set()
     worker: Worker | None = None
     try:
         for number, (kind, name) in enumerate(calls):
+            if kind in given_up:
+                continue
             if progress is not None:
                 progress(f"{name}, {kind}", number / len(calls))
             if name not in report.checks:
                 report.checks.append(name)
+            fresh = bool(offered[kind].canBeInstantiatedOnlyOncePerProcess)
             try:
                 worker = worker or _fresh(path, kind)
-                once = bool(offered[kind].canBeInstantiatedOnlyOncePerProcess)
                 if name == "step size":
-                    worker = _wrong_steps(worker, report, kind, once=once)
+                    worker = _wrong_steps(worker, report, kind, once=fresh)
                 else:
-                    for found in worker.call("check", str(path), kind, name, limit=limit):
-                        report.add(found)
-                if once and worker is not None:
+                    found = worker.call("check", str(path), kind, name, limit=limit)
+                    for each in _repeatable(path, kind, name, found):
+                        report.add(each)
+                    if name == "start" and any(f.what.startswith(NOT_MADE) for f in found):
+                        given_up.add(kind)
+                    fresh |= name == "cycles" and bool(found)
+                if fresh and worker is not None:
                     worker.close()
                     worker = None
             except ProcessError as error:
@@ -172,12 +193,56 @@ def check_fmu(
                 worker = None
                 report.add(Finding(name, ERROR, kind, str(error), "so does its importer's process"))
             except TerrafixError as error:
-                report.add(Finding(name, ERROR, kind, str(error), "no importer gets further"))
-                break
+                cannot = isinstance(error, ConfigurationError) and "cannot be loaded" in str(error)
+                severity = WARNING if cannot else ERROR
+                report.add(Finding(name, severity, kind, str(error), "no importer gets further"))
+                given_up.add(kind)
     finally:
         if worker is not None:
             worker.close()
     return report
+
+
+def _has_binary(archive: Archive, kind: str, report: Report) -> bool:
+    """Whether this machine can call the FMU; the report says where it cannot."""
+    description = archive.description
+    interface = description.coSimulation if kind == CO_SIMULATION else description.modelExchange
+    try:
+        archive.binary(interface.modelIdentifier)
+    except ConfigurationError as error:
+        why = str(error).splitlines()[0].removeprefix(f"'{archive.path}' ")
+        said = f"it was not called: it {why}"
+        report.add(Finding("run", NOTE, kind, said, "what it does there was not checked"))
+        return False
+    return True
+
+
+def _repeatable(path: str | Path, kind: str, name: str, found: list[Finding]) -> Iterator[Finding]:
+    """Findings; notes of an FMU that is not twice the same, which differs for that reason."""
+    doubtful = name in _REPEATED and any(f.severity != NOTE for f in found)
+    if not doubtful or _same_twice(path, kind):
+        yield from found
+        return
+    for each in found:
+        if each.severity == NOTE:
+            yield each
+    yield Finding(name, NOTE, kind, "two processes get different outputs from it: nothing follows "
+                  "from what differs")  # fmt: skip
+
+
+def _same_twice(path: str | Path, kind: str) -> bool:
+    """Whether the FMU gives the same outputs in two processes."""
+    samples = []
+    for _ in range(2):
+        worker = _fresh(path, kind)
+        try:
+            samples.append(worker.call("sample", str(path), kind, limit=FIRST_LIMIT))
+        except TerrafixError:
+            return True  # as far as it can be told
+        finally:
+            worker.close()
+    first, second = samples
+    return bool(np.array_equal(first, second, equal_nan=True))
 
 
 def _fresh(path: str | Path, kind: str) -> Worker:
@@ -203,10 +268,9 @@ def _wrong_steps(worker: Worker, report: Report, kind: str, *, once: bool) -> Wo
         except ProcessError as error:
             now.close(kill=True)
             now = None
-            what = {"negative": "a negative step", "NaN": "a step of NaN"}.get(case, "a fraction")
             report.add(
                 Finding(
-                    "step size", WARNING, "doStep", f"asked for {what}, {error}",
+                    "step size", WARNING, "doStep", f"asked for {_WRONG[case]}, {error}",
                     "one wrong step costs the whole process",
                 )
             )  # fmt: skip
@@ -216,11 +280,29 @@ def _wrong_steps(worker: Worker, report: Report, kind: str, *, once: bool) -> Wo
     return now
 
 
-def _validated(path: str | Path) -> list[str]:
-    """What FMPy's validation says."""
+def _validated(archive: Archive) -> list[str]:
+    """What FMPy's validation says, and the standard too."""
     from fmpy.validation import validate_fmu
 
     try:
-        return [str(problem).strip().splitlines()[0] for problem in validate_fmu(str(path))]
+        found = [str(p).strip().splitlines()[0] for p in validate_fmu(str(archive.path))]
     except Exception as error:  # FMPy raises many types for what it cannot read
         return [str(error)]
+    return [problem for problem in found if not _is_of_clocks(problem, archive)]
+
+
+def _is_of_clocks(problem: str, archive: Archive) -> bool:
+    """Whether initial unknowns differ by clocks, which have no start, and clocked variables.
+
+    FMI 3.0 lists outputs that are no "clocked variables" and have an `initial`, and clocked
+    variables "that the FMU wishes to initialize".
+    """
+    match = re.search(r"InitialUnknowns .*Expected \{(.*)\} but was \{(.*)\}\.$", problem)
+    if match is None:
+        return False
+    expected, given = (set(filter(None, map(str.strip, s.split(",")))) for s in match.groups())
+    variables = {v.name: v for v in archive.description.modelVariables}
+    return all(
+        name in variables and (variables[name].type == "Clock" or variables[name].clocks)
+        for name in expected ^ given
+    )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import stat
 import zipfile
 import zlib
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -20,6 +22,8 @@ from terrafix.cosim.exchange.fmi.run.platforms import host_platform
 MOST_BYTES = 4 << 30
 MOST_FILES = 20_000
 MOST_XML = 256 << 20
+MOST_ELEMENTS = 1 << 27
+"""Of one array: a gibibyte of numbers."""
 
 
 @dataclass
@@ -34,8 +38,8 @@ class Archive:
         Where it was unpacked; removed when this process ends.
     description : fmpy.model_description.ModelDescription
     version : {1, 2, 3}
-    directional : bool
-        Whether it says that it has directional derivatives.
+    directional : frozenset of str
+        Elements of the interfaces that say that they have directional derivatives.
     annotation : Element or None
         What terrafix wrote about the ports of an FMU of its own.
     negated : frozenset of str
@@ -48,7 +52,7 @@ class Archive:
     folder: Path
     description: Any
     version: int
-    directional: bool = False
+    directional: frozenset[str] = frozenset()
     annotation: Any = field(default=None, repr=False)
     negated: frozenset[str] = frozenset()
     clocks: tuple[ClockSaid, ...] = ()
@@ -124,9 +128,9 @@ def unpack(file: Path, folder: Path, what: str = "FMU") -> None:
             _refuse_unsafe(file, members)
             written = 0
             for member in members:
-                if member.is_dir():
+                if _is_folder(member):
                     continue
-                target = folder / PurePosixPath(member.filename)
+                target = folder / _path(member)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(member) as source, target.open("wb") as sink:
                     while chunk := source.read(1 << 20):
@@ -143,14 +147,30 @@ def unpack(file: Path, folder: Path, what: str = "FMU") -> None:
         raise ConfigurationError(f"cannot unpack '{file}': {error}") from error
 
 
+def _path(member: zipfile.ZipInfo) -> PurePosixPath:
+    """Where a file belongs; tools on Windows write backslashes."""
+    return PurePosixPath(member.filename.replace("\\", "/"))
+
+
+def _is_folder(member: zipfile.ZipInfo) -> bool:
+    return member.filename.endswith(("/", "\\"))
+
+
 def _refuse_unsafe(file: Path, members: list[zipfile.ZipInfo]) -> None:
     if len(members) > MOST_FILES:
         raise _unsafe(file, f"it holds {len(members)} files")
+    files = {(_path(m), m.CRC, m.file_size) for m in members if not _is_folder(m)}
+    twice = [str(name) for name, n in Counter(name for name, *_ in files).items() if n > 1]
+    if twice:
+        raise _unsafe(
+            file,
+            f"it holds '{twice[0]}' twice, differently, and readers differ in which one counts",
+        )
     total = sum(m.file_size for m in members)
     if total > MOST_BYTES:
         raise _unsafe(file, f"it unpacks to {total / 2**30:.1f} GiB")
     for member in members:
-        name = PurePosixPath(member.filename.replace("\\", "/"))
+        name = _path(member)
         outside = name.is_absolute() or ".." in name.parts or ":" in member.filename
         if outside:
             raise _unsafe(file, f"it would write outside its folder, to '{member.filename}'")
@@ -217,6 +237,23 @@ def _complete_fmi1(root: Any, description: Any, file: Path) -> frozenset[str]:
     return frozenset(v.get("name", "") for v in variables if v.get("alias") == "negatedAlias")
 
 
+def _check_variables(description: Any, file: Path) -> None:
+    """References are numbers of 32 bits, and arrays have sizes."""
+    for variable in description.modelVariables:
+        reference = int(variable.valueReference)
+        if not 0 <= reference < 1 << 32:
+            raise ConfigurationError(
+                f"'{file}': the valueReference of '{variable.name}' is {reference}; FMI demands 0 "
+                "to 4294967295\n  ask for another from the tool that wrote it"
+            )
+        shape = [int(n) for n in variable.shape or ()]
+        if min(shape, default=0) < 0 or math.prod(shape) > MOST_ELEMENTS:
+            raise ConfigurationError(
+                f"'{file}': '{variable.name}' is an array of {' x '.join(map(str, shape))}; "
+                f"terrafix holds up to {MOST_ELEMENTS} numbers of one variable"
+            )
+
+
 def _bound_unsigned(root: Any, description: Any) -> None:
     """Read the bounds of unsigned integers, which FMPy leaves out."""
     variables = {v.name: v for v in description.modelVariables if v.type.startswith("UInt")}
@@ -263,12 +300,14 @@ def _read(file: Path, folder: Path) -> Archive:
     for tag in ("CoSimulation", "ModelExchange", "ScheduledExecution"):
         for each in root.iter(tag):
             _check_identifier(each.get("modelIdentifier", ""), tag, file)
+    _check_variables(description, file)
     _bound_unsigned(root, description)
-    directional = any(
-        each.get(name) in ("true", "1")
+    directional = frozenset(
+        tag
         for tag in ("CoSimulation", "ModelExchange")
         for each in root.iter(tag)
         for name in ("providesDirectionalDerivatives", "providesDirectionalDerivative")
+        if each.get(name) in ("true", "1")
     )
     annotation = next(root.iter("Interface"), None)
     number = int(version[0])

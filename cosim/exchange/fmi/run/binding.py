@@ -63,11 +63,14 @@ class FmuError(TerrafixError):
     ----------
     status : int
         As FMI numbers them: 1 warning, 2 discard, 3 error, 4 fatal.
+    function : str
+        Its name without ``fmi2`` or ``fmi3``.
     """
 
-    def __init__(self, text: str, status: int = 3) -> None:
+    def __init__(self, text: str, status: int = 3, function: str = "") -> None:
         super().__init__(text)
         self.status = status
+        self.function = function
 
 
 class FmuEndedError(FmuError):
@@ -305,7 +308,7 @@ class Instance:
         with Kept():
             made = function(*arguments)
         if not made:
-            raise FmuError(f"the FMU could not be instantiated{self.said()}")
+            raise FmuError(f"the FMU could not be instantiated{self.said()}", 3, "Instantiate")
         self.pointer = ct.c_void_p(made)
 
     def _creation(self, name: str) -> tuple[Any, list[Any]]:
@@ -355,23 +358,26 @@ class Instance:
         if status > accept:
             what = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
             full = f"{self.library.prefix}{name}"
-            raise FmuError(f"{full} returned {what}{self.said()}", status)
+            raise FmuError(f"{full} returned {what}{self.said()}", status, name)
         return status
 
     # ------------------------------------------------------------------ life cycle
 
-    def begin(self, t: float, tolerance: float | None = None) -> None:
-        """Enter initialization mode at a time [s]; with the tolerance of its own solver, if any."""
-        none, time = ct.c_double(0.0), ct.c_double(t)
+    def begin(self, t: float, tolerance: float | None = None, stop: float | None = None) -> None:
+        """Enter initialization mode at a time [s]; with the tolerance of its own solver, if any.
+
+        `stop` is the time after which nothing is asked of it; none is told if absent.
+        """
         self._start = t
         self.clocks.begin(t)
-        given = ct.c_double(tolerance or 0.0)
+        time, given = ct.c_double(t), ct.c_double(tolerance or 0.0)
+        flag = ct.c_int if self._version == 2 else ct.c_bool
+        end = flag(stop is not None), ct.c_double(stop or 0.0)
         if self._version == 2:
-            self.call("SetupExperiment", int(bool(tolerance)), given, time, 0, none)
+            self.call("SetupExperiment", flag(bool(tolerance)), given, time, *end)
             self.call("EnterInitializationMode")
         else:
-            has, no = ct.c_bool(bool(tolerance)), ct.c_bool(False)
-            self.call("EnterInitializationMode", has, given, time, no, none)
+            self.call("EnterInitializationMode", flag(bool(tolerance)), given, time, *end)
 
     def finish(self) -> None:
         """Leave initialization mode."""

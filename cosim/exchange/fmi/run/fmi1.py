@@ -45,9 +45,9 @@ class InstanceOfFmi1(Instance):
             *(ct.c_double(0.0), _NO, _NO, functions, _YES),
         ]
 
-    def begin(self, t: float, tolerance: float | None = None) -> None:
+    def begin(self, t: float, tolerance: float | None = None, stop: float | None = None) -> None:
         """Note the time of initialization [s]: until then, inputs and start values may be set."""
-        del tolerance
+        del tolerance, stop
         self._start = t
 
     def finish(self) -> None:

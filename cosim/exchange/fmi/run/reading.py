@@ -8,6 +8,7 @@ identifiers are written with underscores.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -167,13 +168,7 @@ class Interface:
 
         Discrete inputs are set and clocks tick there. Without them an FMU handles events itself.
         """
-        interface = self.archive.description.coSimulation
-        if self.kind != CO_SIMULATION or not getattr(interface, "hasEventMode", False):
-            return False
-        return any(
-            v.type == "Clock" or (v.causality == "input" and v.variability == "discrete")
-            for v in self.archive.description.modelVariables
-        )
+        return uses_event_mode(self.archive, self.kind)
 
     @property
     def input_clocks(self) -> list[str]:
@@ -206,6 +201,17 @@ class Interface:
             for p in self.ports
         ]
         return replace(self, ports=ports)
+
+
+def uses_event_mode(archive: Archive, kind: str) -> bool:
+    """Whether an FMU has event mode in co-simulation (FMI 3), and a use for it."""
+    interface = archive.description.coSimulation
+    if kind != CO_SIMULATION or not getattr(interface, "hasEventMode", False):
+        return False
+    return any(
+        v.type == "Clock" or (v.causality == "input" and v.variability == "discrete")
+        for v in archive.description.modelVariables
+    )
 
 
 def read_interface(
@@ -372,6 +378,8 @@ def _extent(indices: Sequence[tuple[int, ...]]) -> tuple[int, ...] | None:
         return None
     low = np.min(indices, axis=0)
     shape = tuple(int(n) for n in np.max(indices, axis=0) - low + 1)
+    if math.prod(shape) != len(indices):
+        return None
     full = [tuple(int(k) for k in np.array(i) + low) for i in np.ndindex(shape)]
     return shape if list(indices) == full and low.max() <= 1 else None
 
@@ -478,7 +486,13 @@ def _starts(members: Sequence[Any]) -> list[float] | list[int] | None:
     kind = members[0].type
     if kind in INTEGER:
         return [whole_start(members[0].name, kind, w) for w in words]
-    return [1.0 if w == "true" else 0.0 if w == "false" else float(w) for w in words]
+    try:
+        return [1.0 if w == "true" else 0.0 if w == "false" else float(w) for w in words]
+    except ValueError as error:
+        word = str(error).rpartition(": ")[2]
+        raise ConfigurationError(
+            f"the FMU says that '{members[0].name}' ({kind}) starts at {word}"
+        ) from error
 
 
 # --------------------------------------------------------------------------------- dependencies

@@ -188,6 +188,9 @@ def serve(functions: dict[str, Any]) -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what foreign code prints is not an answer
     requests = os.fdopen(os.dup(0), "rb")
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)  # nor are requests what it may read
+    os.close(nothing)
     answer_requests(functions, requests, answers)
 
 

@@ -536,6 +536,7 @@ F void fmi3FreeInstance(void *c) { free(c); }
 F int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool e, double f)
 {
     of(c)->mode = INIT;
+    of(c)->t = d, of(c)->due += d, of(c)->mine += d;
     return 0;
 }
 F int fmi3ExitInitializationMode(void *c) { of(c)->mode = EVENT; return 0; }

@@ -169,12 +169,13 @@ def plain_fmu(
     step: str = "",
     check: str = "",
     structure: bool = True,
+    interface: str = "",
 ) -> Path:
     """Build an FMU.
 
     `begin` is done on leaving initialization mode, `outputs` whenever something is asked for,
     `check` after something is set (``REFUSE("why");`` refuses it). Without `structure`, initial
-    unknowns are not listed.
+    unknowns are not listed. `interface` is more XML of its co-simulation.
     """
     from fmpy import __file__ as fmpy
 
@@ -222,7 +223,7 @@ def plain_fmu(
         '<?xml version="1.0" encoding="UTF-8"?><fmiModelDescription fmiVersion="2.0" '
         f'modelName="{path.stem}" guid="plain">'
         '<CoSimulation modelIdentifier="plain" canHandleVariableCommunicationStepSize="true" '
-        'canGetAndSetFMUstate="true"/>'
+        f'canGetAndSetFMUstate="true"{interface}/>'
         + (f"<UnitDefinitions>{units}</UnitDefinitions>" if units else "")
         + (
             '<TypeDefinitions><SimpleType name="mode"><Enumeration><Item name="off" value="1"/>'

@@ -23,7 +23,7 @@ typedef void (*logger2)(void *, const char *, int, const char *, const char *, .
 typedef void (*logger3)(void *, int, const char *, const char *);
 struct callbacks { logger2 logger; void *allocate, *release, *finished, *environment; };
 struct inst {
-    double r[32], start, tolerance;
+    double r[32], start, tolerance, stop;
     int64_t n[32], flags;
     char name[64];
     logger2 log2;
@@ -50,7 +50,12 @@ static int enter(struct inst *m, int defined, double tolerance, double start)
     ENTER
     return 0;
 }
-static int do_step(struct inst *m, double t, double h) { STEP return 0; }
+static int do_step(struct inst *m, double t, double h)
+{
+    if (t + h > m->stop * (1 + 1e-9)) return 3;
+    STEP
+    return 0;
+}
 #define PLAIN(v, name, type, cell) \\
     EXPORT int fmi##v##Get##name(struct inst *m, const uint32_t *vr, size_t n, type *out) \\
     { for (size_t k = 0; k < n; k++) out[k] = (type)m->cell[vr[k]]; return 0; } \\
@@ -87,12 +92,12 @@ EXPORT void *fmi2Instantiate(const char *name, int kind, const char *token, cons
 }
 EXPORT int fmi2SetupExperiment(struct inst *m, int defined, double tolerance, double start,
                                int stop_defined, double stop)
-{ return enter(m, defined, tolerance, start); }
+{ m->stop = stop_defined ? stop : INFINITY; return enter(m, defined, tolerance, start); }
 EXPORT int fmi2EnterInitializationMode(void *m) { return 0; }
 EXPORT int fmi2DoStep(struct inst *m, double t, double h, int same) { return do_step(m, t, h); }
 EXPORT int fmi3EnterInitializationMode(struct inst *m, _Bool defined, double tolerance,
                                        double start, _Bool stop_defined, double stop)
-{ return enter(m, defined, tolerance, start); }
+{ m->stop = stop_defined ? stop : INFINITY; return enter(m, defined, tolerance, start); }
 EXPORT void *fmi3InstantiateCoSimulation(const char *name, const char *token, const char *where,
     _Bool visible, _Bool logging, _Bool events, _Bool early, const uint32_t *vr, size_t n,
     void *environment, logger3 log, void *intermediate)
@@ -100,6 +105,7 @@ EXPORT void *fmi3InstantiateCoSimulation(const char *name, const char *token, co
     struct inst *m = create(name);
     m->log3 = log;
     m->environment = environment;
+    m->flags = events;
     return m;
 }
 EXPORT int fmi3DoStep(struct inst *m, double t, double h, _Bool same, _Bool *event, _Bool *end,

@@ -14,9 +14,21 @@ from small_fmus import Variable, small_fmu
 
 from terrafix.cli import main
 from terrafix.cosim.exchange.fmi.check import check
-from terrafix.cosim.exchange.fmi.check.binary_checks import _SYSTEM, parse, required
+from terrafix.cosim.exchange.fmi.check.binary_checks import (
+    _SYSTEM,
+    _is_shown,
+    check_binaries,
+    parse,
+    required,
+)
 from terrafix.cosim.exchange.fmi.check.binary_checks import exported as exported_names
-from terrafix.cosim.exchange.fmi.check.check import check_fmu
+from terrafix.cosim.exchange.fmi.check.check import Report, check_fmu
+from terrafix.cosim.exchange.fmi.check.checks import run_check
+from terrafix.cosim.exchange.fmi.check.findings import ERROR, NOTE, WARNING, Finding
+from terrafix.cosim.exchange.fmi.check.page import page
+from terrafix.cosim.exchange.fmi.run.archive import open_archive
+from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION
+from terrafix.cosim.exchange.fmi.run.platforms import host_platform
 
 COMPONENTS = (
     *("orbit", "attitude", "antenna", "ads", "imu"),
@@ -239,3 +251,164 @@ def test_libraries_of_windows_and_symbols_of_mac_os():
         assert _SYSTEM.search(name)
     assert not _SYSTEM.search("cvodes.dll")
     assert not _SYSTEM.search("myversion.dll")
+
+
+# ------------------------------------------------------------------ nobody is accused wrongly
+
+
+def repacked(source, target, name=lambda name: name, xml=lambda text: text, more=()):
+    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w") as out:
+        for each in archive.namelist():
+            data = archive.read(each)
+            if each == "modelDescription.xml":
+                data = xml(data.decode()).encode()
+            out.writestr(name(each), data)
+        for each, data in more:
+            out.writestr(each, data)
+    return target
+
+
+def said_by(file, check):
+    """What one check says, in this process: (severity, what)."""
+    return [(f.severity, f.what) for f in run_check(str(file), CO_SIMULATION, check)]
+
+
+def test_no_binary_for_this_machine_is_no_breach(tmp_path):
+    elsewhere = {"linux64": "win64", ".so": ".dll"}
+
+    def moved(name):
+        for old, new in elsewhere.items():
+            name = name.replace(old, new)
+        return name
+
+    if host_platform().folder(2) != "linux64":
+        pytest.skip("another machine")
+    file = repacked(small_fmu(tmp_path / "a.fmu", 2, [U, Y]), tmp_path / "b.fmu", moved)
+    report = check_fmu(file)
+    assert [f.check for f in report.findings if f.check != "description"] == []
+    notes = [n.what for n in report.notes if n.check == "run"]
+    assert notes == ["it was not called: it has no binary for this machine, linux64; it has win64"]
+    assert "not checked" in page(report)
+
+
+def test_libraries_that_lie_beside_the_binary_need_no_functions_of_fmi(tmp_path):
+    helper = next(Path(fmpy.__file__).parent.rglob(f"logging{host_platform().suffix}"))
+    folder = f"binaries/{host_platform().folder(2)}"
+    source = small_fmu(tmp_path / "a.fmu", 2, [U, Y])
+    beside = [(f"{folder}/helper{helper.suffix}", helper.read_bytes())]
+    file = repacked(source, tmp_path / "b.fmu", more=beside)
+    assert [f for f in check_binaries(open_archive(file)) if f.severity == ERROR] == []
+    file = repacked(source, tmp_path / "c.fmu", lambda n: n.replace("small.", "other."))
+    wrong = [f for f in check_binaries(open_archive(file)) if f.severity == ERROR]
+    assert [(f.where, f.what.split(",")[0]) for f in wrong] == [(folder, "it has no 'small'")]
+
+
+def test_external_symbols_of_a_mach_o():
+    """n_type of <mach-o/nlist.h>: N_SECT 0xe, N_EXT 1, N_PEXT 0x10, N_STAB 0xe0, N_UNDF 0."""
+    assert _is_shown(0x0F)
+    assert not any(map(_is_shown, (0x0E, 0x01, 0x1F, 0x2F)))
+
+
+STATE = """
+EXPORT int fmi2GetFMUstate(struct inst *m, struct inst **s)
+{ if (!*s) *s = malloc(sizeof *m); **s = *m; return 0; }
+EXPORT int fmi2FreeFMUstate(struct inst *m, struct inst **s) { free(*s); *s = 0; return 0; }
+EXPORT int fmi2SetFMUstate(struct inst *m, struct inst *s)
+{ double u = m->r[0], y = s->r[1] * (1 + OFF); *m = *s; m->r[0] = u; m->r[1] = y; return 0; }
+EXPORT int fmi2GetDirectionalDerivative(void *m, const uint32_t *u, size_t n, const uint32_t *k,
+                                        size_t nk, const double *in, double *out)
+{ *out = SLOPE * *in; return 0; }
+"""
+ABLE = ' canGetAndSetFMUstate="true" providesDirectionalDerivative="true"'
+
+
+@pytest.mark.parametrize(
+    ("slope", "right"), [("0", True), ("0.001", True), ("0.002", False), ("-1", False)]
+)
+def test_derivatives_at_once_and_through_a_step_are_both_right(tmp_path, slope, right):
+    """y' = u over 1 ms: dy/du is 0 at once and 0.001 through a step; inputs are no state of it."""
+    file = small_fmu(
+        tmp_path / "a.fmu", 2, [U, Variable("y", start="1.0")], step="m->r[1] += h * m->r[0];",
+        globals_=f"#define OFF 0\n#define SLOPE {slope}\n{STATE}", interface=ABLE,
+    )  # fmt: skip
+    assert (not [s for s, _ in said_by(file, "derivatives") if s != NOTE]) == right
+
+
+@pytest.mark.parametrize(("off", "severity"), [("1e-6", WARNING), ("1e-2", ERROR)])
+def test_a_solver_that_starts_anew_is_no_breach(tmp_path, off, severity):
+    file = small_fmu(
+        tmp_path / "a.fmu", 2, [U, Variable("y", start="1.0")], step="m->r[1] += h;",
+        globals_=f"#define OFF {off}\n#define SLOPE 0\n{STATE}", interface=ABLE,
+    )  # fmt: skip
+    assert [s for s, _ in said_by(file, "state") if s != NOTE] == [severity]
+
+
+def test_a_refusal_of_start_values_is_no_breach(tmp_path):
+    file = small_fmu(tmp_path / "a.fmu", 2, [U, Y], enter="return 3;")
+    assert said_by(file, "run") == [(WARNING, "fmi2SetupExperiment returned Error")]
+
+
+def test_an_fmu_that_is_never_twice_the_same_is_not_accused_of_a_bad_reset(tmp_path):
+    text = "#include <unistd.h>\n"
+    file = small_fmu(tmp_path / "a.fmu", 2, [U, Y], step="m->r[1] = getpid();", globals_=text)
+    accused = [Finding("reset", ERROR, "y", "it differs")]
+    found = [*check._repeatable(file, CO_SIMULATION, "reset", accused)]
+    assert [(f.severity, f.check) for f in found] == [(NOTE, "reset")]
+    assert "two processes get different outputs" in found[0].what
+
+
+def test_wrong_steps_of_an_fmu_that_lives_once_in_a_process(tmp_path, monkeypatch):
+    """Each in a process of its own: the second instance of one would be refused."""
+    monkeypatch.setattr(check, "WRONG_STEP_LIMIT", 1.0)
+    file = small_fmu(
+        tmp_path / "a.fmu", 2, [U, Y], enter="m->stop = INFINITY; if (made++) return 3;",
+        step="for (volatile int k = 0; h < 0; k++) ; if (h == 0) abort();",
+        globals_="static int made;", interface=' canBeInstantiatedOnlyOncePerProcess="true"',
+    )  # fmt: skip
+    report = Report(file, 2, "small", (CO_SIMULATION,))
+    worker = check._fresh(file, CO_SIMULATION)
+    assert check._wrong_steps(worker, report, CO_SIMULATION, once=True) is None
+    assert [f.what for f in report.findings] == ["a step past the stop time is accepted"]
+    assert [f.what for f in report.warnings] == [
+        "asked for a negative step, the FMU did not answer within 1 s",
+        "asked for a step of zero, the FMU crashed its process (signal 6)",
+        "a step of NaN is accepted",
+    ]
+
+
+def test_event_mode_is_used_where_the_fmu_has_a_use_for_it(tmp_path):
+    """It refuses to live without (FMI 3, a discrete input)."""
+    text = """
+    EXPORT int fmi3EnterEventMode(void *m) { return 0; }
+    EXPORT int fmi3EnterStepMode(void *m) { return 0; }
+    EXPORT int fmi3UpdateDiscreteStates(void *m, _Bool *a, _Bool *b, _Bool *c, _Bool *d, _Bool *e,
+                                        double *t)
+    { *a = *b = *c = *d = *e = 0; return 0; }
+    """
+    discrete = Variable("n", "Integer", causality="input", start="0")
+    file = small_fmu(
+        tmp_path / "a.fmu", 3, [U, Y, discrete], globals_=text, interface=' hasEventMode="true"',
+        step="if (!m->flags) return 3;",
+    )  # fmt: skip
+    assert said_by(file, "run") == []
+
+
+def test_the_page(tmp_path, capsys):
+    file = repacked(
+        small_fmu(tmp_path / "a.fmu", 2, [U, Y]), tmp_path / "b.fmu",
+        lambda n: n.replace("small.", "other."),
+        lambda text: text.replace('modelName="small"', 'modelName="&lt;script&gt;"'),
+    )  # fmt: skip
+    with pytest.raises(SystemExit) as done:
+        main(["check-fmu", str(file), "--page", str(tmp_path / "p.html"), "--json"])
+    assert done.value.code == 1
+    said = json.loads(capsys.readouterr().out)
+    text = (tmp_path / "p.html").read_text()
+    assert "<h1>&lt;script&gt;</h1>" in text
+    assert "<script>" not in text
+    assert f"<b>{len(said['findings'])} breach" in text
+    assert "it has no &#39;small&#39;" in text
+    assert text.count("not checked</td>") == 9
+    with pytest.raises(SystemExit) as done:
+        main(["check-fmu", str(file), "--page", str(tmp_path / "p.txt")])
+    assert done.value.code == 2

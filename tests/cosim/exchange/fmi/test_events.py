@@ -143,14 +143,15 @@ def test_a_restored_model_goes_on_without_an_event_of_its_own(ball, tmp_path, so
 # ------------------------------------------------------------------ co-simulation with FMI 3
 
 
-def test_event_mode_of_co_simulation(tmp_path):
+@pytest.mark.parametrize("start_time", ["0 s", "5 s"])
+def test_event_mode_of_co_simulation(tmp_path, start_time):
     """The FMU refuses discrete inputs outside of event mode, and steps over its own events.
 
     y = (integral of u, number of time events every 0.25 s, number of its own events at every
-    0.15 s, where it returns early): at t = 1 s 4.5, 4 and 6.
+    0.15 s, where it returns early): at t = 1 s 4.5, 4 and 6, whatever the FMU's time is at t = 0.
     """
     file = eventful.stepping(tmp_path / "stepping.fmu")
-    y = simulate(driven(file), duration="1").dataset["part.y"].values[:, 0]
+    y = simulate(driven(file, start_time=start_time), duration="1").dataset["part.y"].values[:, 0]
     assert y[-1] == pytest.approx([4.5, 4.0, 6.0], abs=1e-12)
     assert y[:, 1].tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4]
     assert y[:, 2].tolist() == [0, 0, 1, 2, 2, 3, 4, 4, 5, 6, 6]
@@ -240,6 +241,22 @@ def test_a_member_whose_fmu_ends_is_complete_and_the_others_go_on(tmp_path, monk
     y = result.dataset["part.y"].values
     assert y[:, 0] == pytest.approx([0, 0.1, 0.2, 0.3, 0.3] + [np.nan] * 4, nan_ok=True)
     assert y[:, 1] == pytest.approx(np.arange(9) / 10)
+
+
+def test_a_member_that_ended_in_a_process_of_its_own_is_terminated(tmp_path):
+    """Once each: member 0 when it ends, member 1 with the run."""
+    log = tmp_path / "terminated"
+    ends = '{ FILE *f = fopen(LOG, "a"); fprintf(f, "%g ", of(c)->stop); fclose(f); return 0; }'
+    source = eventful.ENDING2.replace(
+        "F int fmi2Terminate(void *c) { return 0; }", f"F int fmi2Terminate(void *c) {ends}"
+    )
+    once = 'modelIdentifier="m" canBeInstantiatedOnlyOncePerProcess="true"'
+    xml = eventful.ENDING2_XML.replace('modelIdentifier="m"', once)
+    defines = f'#include <stdio.h>\n#define ENDS 1\n#define LOG "{log}"\n'
+    file = eventful.make_fmu(tmp_path / "e.fmu", source, xml, fmi=2, defines=defines)
+    result = simulate(ending(file, [0.3, 9.0]), members=2, duration="0.8")
+    assert (result.status, result.excluded) == ("complete", [])
+    assert log.read_text().split() == ["0.3", "9"]
 
 
 def test_a_run_whose_members_have_all_ended_is_complete(tmp_path):

@@ -91,6 +91,7 @@ def test_an_fmu_that_prints_does_not_break_json(tmp_path, options):
         ("_exit(0);", "ended it (exit status 0)"),
         ("exit(3);", "ended it (exit status 3)"),
         ("*(volatile int *)0 = 1;", "crashed it (signal 11)"),
+        ("int kill(int, int); kill(getpid(), 9);", "crashed it (signal 9)"),
     ],
 )
 def test_an_fmu_that_ends_the_process_of_the_run(tmp_path, does, said):
@@ -100,6 +101,14 @@ def test_an_fmu_that_ends_the_process_of_the_run(tmp_path, does, said):
     assert f"'a', which runs in the process of the simulation, {said}" in errors
     assert "isolate = true" in errors
     assert json.loads(out)["error"]["status"] == 1
+
+
+def test_an_isolated_fmu_that_reads_gets_nothing_of_ours(tmp_path):
+    """Its standard input is empty; what we ask of it came that way."""
+    file = foreign(tmp_path / "x.fmu", "char b[4]; i->y = read(0, b, 4);")
+    words = ("run", system(tmp_path, file, "isolate = true"), "--json")
+    status, out, errors = finished(*words, folder=tmp_path)
+    assert (status, json.loads(out)["status"]) == (0, "complete"), errors
 
 
 def test_an_isolated_fmu_that_ends_its_process(tmp_path):

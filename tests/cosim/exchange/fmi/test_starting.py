@@ -157,6 +157,29 @@ def test_a_loop_is_repeated_until_it_stands_still(affine):
     )
 
 
+def test_a_loop_settles_with_a_process_for_each_member(tmp_path, caplog):
+    """y = 0.5 y + 1 has the solution 2, and each member's log comes with its name."""
+    say = 'm->callbacks->logger(m->callbacks->componentEnvironment, "plain", fmi2Warning, "log",'
+    file = plain_fmu(
+        tmp_path / "affine.fmu",
+        [V("u", "input", 0.0), V("y", "output", depends="u"), V("s", "output", depends="u")],
+        begin=f's = u; {say} "starts from %.9g", u);',
+        outputs="y = 0.5 * u + 1.0;",
+        interface=' canBeInstantiatedOnlyOncePerProcess="true"',
+    )
+    system = pair(file, ("a.y", "b.u"), ("b.y", "a.u"))
+    simulation = Simulation(system, members=2)
+    simulation.run_until("0.1")
+    slots = simulation.master.wiring.slots
+    found = np.concatenate([slots[p].data[:, 0] for p in ("a.y", "b.s")])
+    simulation.master.terminate()
+    assert found == pytest.approx([2.0] * 4, abs=1e-11)
+    said = [r.getMessage() for r in caplog.records if "starts from" in r.getMessage()]
+    assert sorted(said) == [
+        f"'{name}', member {k}, t = 0 s: Warning: starts from 2" for name in "ab" for k in (0, 1)
+    ]
+
+
 def test_a_loop_that_does_not_settle_is_named(affine):
     system = pair(affine[2.0], ("a.y", "b.u"), ("b.y", "a.u"))
     with pytest.raises(StepError, match=r"'a.y -> b.u', 'b.y -> a.u' did not settle in 1000"):
