@@ -114,20 +114,15 @@ def read_set(root: ET.Element, prefix: str) -> dict[str, Value]:
 
 
 def mapped(values: Mapping[str, Value], mapping: ET.Element, where: str) -> dict[str, Value]:
-    """Values under the names that a parameter mapping gives them.
-
-    A name that the mapping does not mention stays as it is; one that it does may have several.
-    """
+    """Values under the names that a parameter mapping gives them: one may have several, or none."""
     found: dict[str, Value] = {}
-    named: set[str] = set()
     for entry in mapping.iter(tag(SSM, "MappingEntry")):
         source, target = str(entry.get("source")), str(entry.get("target"))
-        named.add(source)
         if source in values:
             keep = entry.get("suppressUnitConversion", "false") not in ("true", "1")
             step = transformation(entry, f"{where}: the mapping of '{source}'")
             found[target] = values[source].through(step, keep_unit=keep)
-    return {n: v for n, v in values.items() if n not in named} | found
+    return found
 
 
 # --------------------------------------------------------------------------------- start values
@@ -179,7 +174,7 @@ def _number(name: str, value: Value, quantity: Quantity, k: int) -> float | int:
     tables = [step.table for step in value.steps if step.table]
     if tables:
         for table in tables:
-            text = _looked_up(name, text, table)
+            text = _looked_up(text, table)
         return _plain(name, text, quantity)
     number = _plain(name, text, quantity)
     unit = (
@@ -200,14 +195,12 @@ def _same_unit(given: str, own: str) -> bool:
     return given == own or (given.endswith(UNDEFINED) and unit_label(given) == unit_label(own))
 
 
-def _looked_up(name: str, text: str, table: Sequence[tuple[str, str]]) -> str:
+def _looked_up(text: str, table: Sequence[tuple[str, str]]) -> str:
+    """What a table makes of a value; what it does not list stays as it is."""
     for source, target in table:
         if text == source or _same(text, source):
             return target
-    raise ConfigurationError(
-        f"'{name}' is {text}, which its mapping does not list; it lists "
-        f"{', '.join(source for source, _ in table)}"
-    )
+    return text
 
 
 def _same(a: str, b: str) -> bool:

@@ -21,20 +21,19 @@ from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError, near
 from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.basics.scratch import scratch_folder
 from terrafix.cosim.basics.units import UNDEFINED, conversion_factor
-from terrafix.cosim.exchange.fmi.run.archive import unpack
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.ssp.documents import read_document
 from terrafix.cosim.exchange.ssp.linear import Linear
 from terrafix.cosim.exchange.ssp.names import OWN, SSD, tag
+from terrafix.cosim.exchange.ssp.packages import Package, open_package, split_name
 from terrafix.cosim.exchange.ssp.parameters import exact, starts_of
 from terrafix.cosim.exchange.ssp.structure import (
-    STRUCTURE,
     End,
     Gathering,
     Link,
     Part,
     Structure,
-    check_version,
+    described,
     identifier,
 )
 from terrafix.cosim.files.choices import Settings
@@ -54,6 +53,8 @@ def read_ssp(
     Parameters
     ----------
     path : path
+        An archive (``x.ssp``), a folder with ``SystemStructure.ssd``, or a description in one;
+        ``x.ssp#B.ssd`` is the description of that name in it.
     settings : sequence of (str, str)
         Step sizes alone: ``("rate", "100 Hz")`` for components without one, ``("a.rate", ...)``.
     outside : bool
@@ -66,26 +67,17 @@ def read_ssp(
     ConfigurationError
         If it is no package, damaged, unsafe, or uses what terrafix does not read; or for settings.
     """
-    file = Path(path)
-    rates = _rates(file, settings)
-    if not file.is_file():
-        raise ConfigurationError(f"there is no SSP package '{path}'")
-    unpacked = folder
-    if unpacked is None:
-        unpacked = scratch_folder("ssp")
-    unpack(file, unpacked, "SSP package")
-    document = unpacked / STRUCTURE
-    if not document.is_file():
-        raise ConfigurationError(f"'{file}' is no SSP package: it has no {STRUCTURE} at its top")
-    root, missing = read_document(document, file)
-    top = root.find(tag(SSD, "System"))
-    if root.tag != tag(SSD, "SystemStructureDescription") or top is None:
-        raise ConfigurationError(f"'{file}': {STRUCTURE} describes no system of SSP 1.0")
-    check_version(file, STRUCTURE, root)
-    gathering = Gathering(file, unpacked, root)
-    gathering.note_undeclared(STRUCTURE, missing)
+    rates = _rates(Path(path), settings)
+    into = scratch_folder("ssp") if folder is None else folder
+    file, chosen = split_name(Path(path))
+    package = open_package(file, into, chosen)
+    name = package.document.name
+    root, missing = read_document(package.document, package.file)
+    top = described(package.file, name, root)
+    gathering = Gathering(package, into, root)
+    gathering.note_undeclared(name, missing)
     structure = gathering.structure(top)
-    system = _Reader(file, unpacked, root, top, rates).system(structure)
+    system = _Reader(package, root, top, rates).system(structure)
     system.notes += gathering.notes
     return system
 
@@ -123,7 +115,9 @@ def import_ssp(path: str | Path, target: Path, settings: Settings = ()) -> Path:
         )
     folder.mkdir()
     try:
-        text = system_text(read_ssp(path, settings, folder=folder))
+        system = read_ssp(path, settings, folder=folder)
+        _collect(system, folder)
+        text = system_text(system)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -132,16 +126,32 @@ def import_ssp(path: str | Path, target: Path, settings: Settings = ()) -> Path:
     return folder
 
 
+def _collect(system: System, folder: Path) -> None:
+    """Copy FMUs that lie elsewhere, those of a package that is a folder."""
+    copies: dict[str, Path] = {}
+    for fmu in (n for n in system.nodes.values() if isinstance(n, Fmu)):
+        file = Path(fmu.given_parameters["file"])
+        if file.is_relative_to(folder.resolve()):
+            continue
+        if str(file) not in copies:
+            target, k = folder.resolve() / file.name, 1
+            while target.exists():
+                target, k = folder.resolve() / f"{file.stem}_{k + 1}{file.suffix}", k + 1
+            shutil.copyfile(file, target)
+            copies[str(file)] = target
+        fmu.file = copies[str(file)]
+
+
 class _Reader:
     def __init__(
         self,
-        file: Path,
-        folder: Path,
+        package: Package,
         root: ET.Element,
         top: ET.Element,
         rates: Mapping[str, Rate],
     ) -> None:
-        self.file, self.folder, self.root, self.top = file, folder, root, top
+        self.file, self.root, self.top = package.file, root, top
+        self.folder = package.root
         self._rates = rates
 
     def system(self, structure: Structure) -> System:

@@ -9,16 +9,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import SI_BASE, unit_by_definition, unit_by_name
-from terrafix.cosim.exchange.fmi.run.archive import unpack
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
 from terrafix.cosim.exchange.ssp.documents import read_document
 from terrafix.cosim.exchange.ssp.names import OSP, OWN, SSC, SSD, SSM, SSV, tag
+from terrafix.cosim.exchange.ssp.packages import Package, open_package
 from terrafix.cosim.exchange.ssp.parameters import (
     Transformation,
     Value,
@@ -28,9 +27,8 @@ from terrafix.cosim.exchange.ssp.parameters import (
     transformation,
 )
 
-STRUCTURE = "SystemStructure.ssd"
 MOST_WITHIN = 10
-_SYSTEM_TYPES = ("application/x-ssp-package", "application/x-ssp-definition")
+PACKAGE, DEFINITION = "application/x-ssp-package", "application/x-ssp-definition"
 VERSIONS = ("1.", "2.0")
 _KINDS = {"any": "auto", "CoSimulation": CO_SIMULATION, "ModelExchange": MODEL_EXCHANGE}
 _SOURCES = {True: ("input", "parameter", "inout"), False: ("output", "calculatedParameter")}
@@ -109,10 +107,9 @@ class Gathering:
 
     Parameters
     ----------
-    file : Path
-        For messages.
-    folder : Path
-        Where it was unpacked.
+    package : Package
+    into : Path
+        Where packages within are unpacked.
     root : Element
         Of its description.
 
@@ -122,9 +119,10 @@ class Gathering:
         What is remarkable about it.
     """
 
-    def __init__(self, file: Path, folder: Path, root: ET.Element) -> None:
+    def __init__(self, package: Package, into: Path, root: ET.Element) -> None:
         self.notes: list[str] = []
-        self._file, self._folder = file, folder
+        self._file, self._into = package.file, into
+        self._package, self._base = package, package.document.parent
         self._units_of = root  # whose units are meant
         self._within: list[str] = []
 
@@ -195,7 +193,7 @@ class Gathering:
                     "  rename one of them"
                 )
             full = self._free(f"{prefix}{name}", into)
-            if kind == "Component" and element.get("type") in _SYSTEM_TYPES:
+            if kind == "Component" and element.get("type") in (PACKAGE, DEFINITION):
                 names[name] = f"system {full}"
                 self._gather_within(element, names[name], f"{full}_", into)
             elif kind == "Component":
@@ -221,34 +219,54 @@ class Gathering:
         What is bound to the component overrules what is bound to that system.
         """
         given = self._values(element)
-        source, folder = self._resource(element.get("source") or ""), self._folder
-        outer = self._units_of
+        outer = self._package, self._base, self._units_of
         if len(self._within) >= MOST_WITHIN:
             raise ConfigurationError(
                 f"'{self._file}': more than {MOST_WITHIN} packages lie within each other"
             )
-        document = source
-        if element.get("type") == _SYSTEM_TYPES[0]:
-            self._folder = folder / f"{prefix}package"
-            unpack(source, self._folder, "SSP package")
-            document = self._folder / STRUCTURE
+        source = element.get("source") or ""
         try:
-            if not document.is_file():
-                raise ConfigurationError(f"'{self._file}': '{source.name}' has no {STRUCTURE}")
-            root, missing = read_document(document, self._file)
-            self.note_undeclared(document.name, missing)
-            check_version(self._file, document.name, root)
-            system = root.find(tag(SSD, "System"))
-            if system is None:
-                raise ConfigurationError(f"'{self._file}': '{source.name}' describes no system")
+            system = (
+                self._by_id(element, source.removeprefix("#"))
+                if source.startswith("#")
+                else self._inner(element, source, f"{prefix}package")
+            )
             self._within.append(key)
-            self._units_of = root
             self._gather(system, key, prefix, into)
             self._within.pop()
         finally:
-            self._folder, self._units_of = folder, outer
+            self._package, self._base, self._units_of = outer
         for name, value in given.items():
             self._set(into, key, name, value)
+
+    def _inner(self, element: ET.Element, source: str, folder: str) -> ET.Element:
+        """The system of the description that a component refers to, which is read from now on."""
+        named, _, description = source.partition("#")
+        document = file = self._resource(named)
+        if element.get("type") == PACKAGE:
+            try:
+                inner = open_package(file, self._into / folder, description)
+            except ConfigurationError as error:
+                text = str(error).replace(str(file), named)
+                raise ConfigurationError(
+                    f"'{self._file}': '{element.get('name')}': {text}"
+                ) from error
+            self._package, document = replace(inner, file=self._file), inner.document
+        root, missing = read_document(document, self._file)
+        self.note_undeclared(document.name, missing)
+        self._base, self._units_of = document.parent, root
+        return described(self._file, document.name, root)
+
+    def _by_id(self, element: ET.Element, wanted: str) -> ET.Element:
+        """Another system of the same document."""
+        for system in self._units_of.iter(tag(SSD, "System")):
+            if system.get("id") == wanted:
+                return system
+        ids = [i for s in self._units_of.iter(tag(SSD, "System")) if (i := s.get("id"))]
+        raise ConfigurationError(
+            f"'{self._file}': '{element.get('name')}' is to be the system with the id '{wanted}'\n"
+            f"  {nearest(wanted, ids, what='ids of systems')}"
+        )
 
     @staticmethod
     def _free(name: str, into: Structure) -> str:
@@ -297,20 +315,16 @@ class Gathering:
         passed: frozenset[End] = frozenset(),
     ) -> None:
         """Set what a hierarchical name means; what is set later overrules what was set before."""
-        readers = [j for j in into.joints if j.source == (owner, name)]
         if owner in into.parts:
             into.parts[owner].starts[name] = value
-        elif (owner, name) in into.kinds or readers:
-            for joint in readers:
-                if joint.target not in passed:
-                    there = value.through(joint.step, keep_unit=joint.keep_unit)
-                    self._set(into, *joint.target, there, passed | {joint.target})
-        else:
-            elements = into.elements.get(owner, {})
-            inside = [e for e in elements if name.startswith(f"{e}.")]
-            if inside:
-                element = max(inside, key=len)
-                self._set(into, elements[element], name[len(element) + 1 :], value)
+            return
+        for joint in into.joints:
+            if joint.source == (owner, name) and joint.target not in passed:
+                there = value.through(joint.step, keep_unit=joint.keep_unit)
+                self._set(into, *joint.target, there, passed | {joint.target})
+        for element, inner in into.elements.get(owner, {}).items():
+            if name.startswith(f"{element}."):  # several may be meant: then all are
+                self._set(into, inner, name[len(element) + 1 :], value, passed)
 
     def _part(self, name: str, element: ET.Element) -> Part:
         kind = element.get("type", "application/x-fmu-sharedlibrary")
@@ -412,12 +426,22 @@ class Gathering:
         return root
 
     def _resource(self, source: str) -> Path:
-        path = (self._folder / source.removeprefix("file:")).resolve()
-        if not path.is_file():
-            path = (self._folder / unquote(source.removeprefix("file:"))).resolve()
-        if not path.is_relative_to(self._folder.resolve()) or not path.is_file():
-            raise ConfigurationError(f"'{self._file}' names '{source}', which is not in it")
-        return path
+        return self._package.resource(source, self._base)
+
+
+def described(file: Path, name: str, root: ET.Element) -> ET.Element:
+    """The system that a description is of.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is of none, or of a version of SSP that is not known.
+    """
+    top = root.find(tag(SSD, "System"))
+    if root.tag != tag(SSD, "SystemStructureDescription") or top is None:
+        raise ConfigurationError(f"'{file}': {name} describes no system of SSP 1.0")
+    check_version(file, name, root)
+    return top
 
 
 def check_version(file: Path, name: str, root: ET.Element) -> None:

@@ -1,0 +1,148 @@
+"""Where packages lie: archives, folders, descriptions chosen by name, packages in packages."""
+
+from __future__ import annotations
+
+import zipfile
+
+import pytest
+from ssp_parts import bindings, bound, packaged, part, system, values
+
+from terrafix.cli import main
+from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
+from terrafix.cosim.exchange.ssp.reading import import_ssp, read_ssp
+from terrafix.cosim.files.readers import read_system
+
+
+def variant(k):
+    return system(part("a", inside=bindings(bound(k=k))))
+
+
+def text_of(tmp_path, top):
+    """A description alone."""
+    with zipfile.ZipFile(packaged(tmp_path / "text.ssp", {}, top)) as archive:
+        return archive.read("SystemStructure.ssd")
+
+
+@pytest.fixture
+def variants(tmp_path, fmus):
+    """k = 2, and in B.ssd 5."""
+    other = text_of(tmp_path, variant("5"))
+    with zipfile.ZipFile(packaged(tmp_path / "x.ssp", fmus, variant("2")), "a") as archive:
+        archive.writestr("B.ssd", other)
+    return tmp_path / "x.ssp"
+
+
+@pytest.fixture
+def unpacked(tmp_path, variants):
+    with zipfile.ZipFile(variants) as archive:
+        archive.extractall(tmp_path / "folder")
+    return tmp_path / "folder"
+
+
+def test_a_description_by_its_name(variants):
+    assert values(variants, "a.y") == [2.0]
+    assert values(f"{variants}#B.ssd", "a.y") == [5.0]
+    with pytest.raises(ConfigurationError) as raised:
+        read_ssp(f"{variants}#C.ssd")
+    assert str(raised.value) == (
+        f"'{variants}' has no description 'C.ssd'\n  it has B.ssd, SystemStructure.ssd"
+    )
+
+
+def test_a_folder_is_a_package(unpacked, tmp_path):
+    before = sorted(unpacked.rglob("*"))
+    for name, k in (("", 2.0), ("#B.ssd", 5.0), ("/B.ssd", 5.0), ("/SystemStructure.ssd", 2.0)):
+        assert values(f"{unpacked}{name}", "a.y") == [k]
+        assert list(read_system(f"{unpacked}{name}").nodes) == ["a"]
+    with pytest.raises(ConfigurationError, match=r"has no description 'C.ssd'\n  it has B.ssd, S"):
+        read_ssp(f"{unpacked}#C.ssd")
+    assert sorted(unpacked.rglob("*")) == before
+    (unpacked / "SystemStructure.ssd").unlink()
+    with pytest.raises(ConfigurationError, match=r"name one, as in '.*folder#B.ssd'"):
+        read_ssp(unpacked)
+
+
+def test_sources_beside_a_folder_but_not_beside_an_archive(tmp_path, fmus):
+    """A folder is somebody's own; an archive may name nothing outside itself."""
+    (tmp_path / "fmus").mkdir()
+    (tmp_path / "fmus" / "k.fmu").write_bytes(fmus["k"])
+    (tmp_path / "d").mkdir()
+    top = system(part("a", "../fmus/k", bindings(bound(k="3"))))
+    (tmp_path / "d" / "SystemStructure.ssd").write_bytes(text_of(tmp_path, top))
+    assert values(tmp_path / "d", "a.y") == [3.0]
+    with pytest.raises(ConfigurationError, match=r"names '../fmus/k.fmu', which is not in it"):
+        read_ssp(packaged(tmp_path / "x.ssp", {}, top))
+    import_ssp(tmp_path / "d", tmp_path / "x.toml")
+    assert (tmp_path / "x_package" / "k.fmu").is_file()
+    assert "../" not in (tmp_path / "x.toml").read_text()
+    assert list(read_system(tmp_path / "x.toml").nodes) == ["a"]
+
+
+def test_what_another_program_runs_is_named(tmp_path, fmus):
+    top = system('<ssd:Component name="a" source="proxyfmu://localhost?file=k.fmu"/>')
+    with pytest.raises(ConfigurationError, match=r"another program is to run \(proxyfmu\)"):
+        read_ssp(packaged(tmp_path / "x.ssp", fmus, top))
+
+
+def held(source, kind="package", inside=""):
+    return f'<ssd:Component name="B" type="application/x-ssp-{kind}" source="{source}">{inside}</ssd:Component>'
+
+
+def test_a_description_of_a_package_within(tmp_path, fmus, variants):
+    inner = variants.read_bytes()
+    top = packaged(tmp_path / "y.ssp", fmus, system(held("in.ssp#B.ssd")), **{"in.ssp": inner})
+    assert values(top, "B_a.y") == [5.0]
+    top = packaged(tmp_path / "y.ssp", fmus, system(held("in.ssp#C.ssd")), **{"in.ssp": inner})
+    with pytest.raises(
+        ConfigurationError,
+        match=r"y.ssp': 'B': 'in.ssp' has no description 'C.ssd'\n  it has B.ssd, System",
+    ):
+        read_ssp(top)
+
+
+def test_a_description_elsewhere_means_what_lies_beside_it(tmp_path, fmus):
+    inner = text_of(tmp_path, variant("8"))
+    files = {"sub/C.ssd": inner, "sub/k.fmu": fmus["k"]}
+    top = system(held("sub/C.ssd", "definition"))
+    assert values(packaged(tmp_path / "y.ssp", {}, top, **files), "B_a.y") == [8.0]
+
+
+def test_a_system_of_the_same_document_by_its_id(tmp_path, fmus):
+    """Twice the system "gain": k is 2 in it, 9 where the component says so."""
+    gain = variant("2").replace('name="top"', 'name="G" id="gain"')
+    again = held("#gain", "definition", bindings(bound(a__k="9")))
+    assert values(packaged(tmp_path / "x.ssp", fmus, system(gain + again)), "G_a.y", "B_a.y") == [
+        2.0,
+        9.0,
+    ]
+    wrong = packaged(tmp_path / "x.ssp", fmus, system(gain + held("#gian", "definition")))
+    with pytest.raises(ConfigurationError, match=r"id 'gian'\n  .*gain"):
+        read_ssp(wrong)
+    itself = system(held("#me", "definition")).replace('name="top"', 'name="top" id="me"')
+    with pytest.raises(ConfigurationError, match="more than 10 packages lie within each other"):
+        read_ssp(packaged(tmp_path / "x.ssp", fmus, itself))
+
+
+def test_a_package_in_a_system_file(tmp_path, variants):
+    file = tmp_path / "s.toml"
+    file.write_text(
+        'schema = "terrafix-system/1"\nname = "s"\nduration = "1 s"\n\n'
+        f'[component.inner]\ntype = "system"\nfile = "{variants.name}#B.ssd"\n'
+    )
+    assert values(variants, "a.y") == [2.0]
+    made = read_system(file)
+    assert made.nodes["inner"].nodes["a"].given_parameters["k"] == 5.0
+    file.write_text(file.read_text().replace("B.ssd", "C.ssd"))
+    with pytest.raises(TerrafixError, match=r"'inner': .*has no description 'C.ssd'"):
+        read_system(file)
+
+
+def test_the_command_line_takes_all_of_them(tmp_path, unpacked, variants, capsys):
+    for name in (variants, f"{variants}#B.ssd", unpacked, unpacked / "B.ssd"):
+        with pytest.raises(SystemExit) as done:
+            main(["run", str(name), "--duration", "0.2", "--quiet"])
+        assert done.value.code == 0
+    with pytest.raises(SystemExit) as done:
+        main(["run", f"{variants}#C.ssd"])
+    assert done.value.code == 2
+    assert "it has B.ssd, SystemStructure.ssd" in capsys.readouterr().err
