@@ -102,6 +102,4 @@ def _description(path: Path, root: Path, name: str) -> Path:
         has = f"it has {', '.join(there)}" if there else "it has none"
         raise ConfigurationError(f"'{path}' has no description '{name}'\n  {has}")
     hint = f"\n  it has {', '.join(there)}: name one, as in '{path}#{there[0]}'" if there else ""
-    raise ConfigurationError(
-        f"'{path}' is no SSP package: it has no {STRUCTURE} at its top{hint}"
-    )
+    raise ConfigurationError(f"'{path}' is no SSP package: it has no {STRUCTURE} at its top{hint}")

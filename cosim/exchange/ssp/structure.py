@@ -183,6 +183,7 @@ class Gathering:
         kinds: dict[End, str] = {}
         for connector in _children(system, "Connectors", "Connector"):
             into.kinds[key, str(connector.get("name"))] = str(connector.get("kind"))
+        rates = {r.get("component"): r for r in _own(system, "Rate")}
         elements = system.find(tag(SSD, "Elements"))
         for element in elements if elements is not None else ():
             kind = element.tag.rpartition("}")[2]
@@ -198,7 +199,7 @@ class Gathering:
                 self._gather_within(element, names[name], f"{full}_", into)
             elif kind == "Component":
                 names[name] = full
-                into.parts[full] = self._part(full, element)
+                into.parts[full] = self._part(full, element, rates.get(name))
             elif kind == "System":
                 names[name] = f"system {full}"
                 self._gather(element, names[name], f"{full}_", into)
@@ -326,7 +327,7 @@ class Gathering:
             if name.startswith(f"{element}."):  # several may be meant: then all are
                 self._set(into, inner, name[len(element) + 1 :], value, passed)
 
-    def _part(self, name: str, element: ET.Element) -> Part:
+    def _part(self, name: str, element: ET.Element, rate: ET.Element | None) -> Part:
         kind = element.get("type", "application/x-fmu-sharedlibrary")
         source = element.get("source") or ""
         if kind != "application/x-fmu-sharedlibrary":
@@ -346,7 +347,8 @@ class Gathering:
             unit = next((c.get("unit") for c in connector if c.get("unit")), None)
             if unit is not None:
                 part.units[str(connector.get("name"))] = self._unit(unit)
-        rate = next(element.iter(tag(OWN, "Rate")), None)
+        if rate is None:  # where it stood before
+            rate = next(element.iter(tag(OWN, "Rate")), None)
         if rate is not None:
             times = rate.get("times")
             part.rate = (
@@ -452,6 +454,12 @@ def check_version(file: Path, name: str, root: ET.Element) -> None:
             f"'{file}': {name} is of version {version} of SSP; terrafix reads 1.x and 2.0\n"
             "  ask the tool that wrote it for one of these"
         )
+
+
+def _own(system: ET.Element, name: str) -> list[ET.Element]:
+    """What an annotation of terrafix says of a system."""
+    annotations = system.find(tag(SSD, "Annotations"))
+    return [] if annotations is None else list(annotations.iter(tag(OWN, name)))
 
 
 def _children(element: ET.Element, group: str, name: str) -> list[ET.Element]:

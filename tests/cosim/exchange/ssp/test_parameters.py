@@ -14,7 +14,6 @@ from terrafix.cosim.exchange.ssp.names import SSC, SSM
 from terrafix.cosim.exchange.ssp.reading import read_ssp
 from terrafix.cosim.system.check import check
 
-
 # ------------------------------------------------------------------ what is set
 
 
