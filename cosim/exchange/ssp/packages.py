@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
@@ -45,7 +46,7 @@ class Package:
         scheme, colon, _ = source.partition("://")
         if colon and scheme != "file":
             raise ConfigurationError(
-                f"'{self.file}' names '{source}', which another program is to run ({scheme})\n"
+                f"'{self.file}' names '{source}', which lies elsewhere\n"
                 "  terrafix runs FMUs that are files: name the file itself"
             )
         plain = source.removeprefix("file://").removeprefix("file:")
@@ -55,6 +56,15 @@ class Package:
                 return path
         where = "is not in it" if self.closed else "is not there"
         raise ConfigurationError(f"'{self.file}' names '{source}', which {where}")
+
+
+def proxied(source: str) -> str | None:
+    """The file that a proxy on this machine is to run: ``proxyfmu://localhost?file=x.fmu``.
+
+    Open Simulation Platform writes so what is to run in a process of its own.
+    """
+    match = re.fullmatch(r"proxyfmu://(?:localhost|127\.0\.0\.1)(?::\d+)?/?\?file=(.+)", source)
+    return None if match is None else match[1]
 
 
 def is_package(path: Path) -> bool:

@@ -42,17 +42,27 @@ class Value:
     Attributes
     ----------
     text : str
+        Of an array all elements, row by row.
     unit : str or None
     kind : str
-        Real, Integer, Boolean, String, Enumeration.
+        Real, Integer, Boolean, String, Enumeration; of SSP 2.0 also Float64, Int32, ...
     steps : tuple of Transformation
         Applied in the unit of what it is set to.
+    words : tuple of str
+        Elements, where they stand one by one.
     """
 
     text: str
     unit: str | None = None
     kind: str = "Real"
     steps: tuple[Transformation, ...] = ()
+    words: tuple[str, ...] = ()
+
+    def elements(self) -> list[Value]:
+        """One value for each element."""
+        one_by_one = self.kind in ("String", "Enumeration", "Binary")
+        words = self.words or ((self.text,) if one_by_one else self.text.split())
+        return [replace(self, text=word, words=()) for word in words]
 
     def through(self, step: Transformation, *, keep_unit: bool = True) -> Value:
         """The value after a transformation."""
@@ -108,8 +118,10 @@ def read_set(root: ET.Element, prefix: str) -> dict[str, Value]:
         if value is None:
             continue
         kind = value.tag.rpartition("}")[2]
-        text = value.get("value", "")
-        found[prefix + str(parameter.get("name"))] = Value(text, value.get("unit"), kind)
+        words = tuple(each.text or "" for each in value if each.tag == tag(SSV, "Value"))
+        text = value.get("value", words[0] if words else "")
+        name = prefix + str(parameter.get("name"))
+        found[name] = Value(text, value.get("unit"), kind, words=words)
     return found
 
 
@@ -141,7 +153,7 @@ def starts_of(fmu: Fmu, values: Mapping[str, Value]) -> dict[str, Any]:
     }
     for quantity in fmu.settable().values():
         names = quantity.scalars()
-        given = [values.get(n) for n in names]
+        given = _elements(quantity, values)
         if all(g is None for g in given):
             continue
         numbers: list[float | int] = []
@@ -157,6 +169,32 @@ def starts_of(fmu: Fmu, values: Mapping[str, Value]) -> dict[str, Any]:
             np.reshape(np.array(numbers, dtype=object), shape).tolist() if shape else numbers[0]
         )
     return starts
+
+
+def sizes_of(fmu: Fmu, values: Mapping[str, Value]) -> dict[str, Any]:
+    """Of what ``start`` is given the structural parameters: they give the others their shapes."""
+    structural = [
+        n for n, q in fmu.interface.parameters.items() if q.causality == "structuralParameter"
+    ]
+    sizes = {n: values[n] for n in structural if n in values}
+    return {n: v for n, v in starts_of(fmu, sizes).items() if n in sizes} if sizes else {}
+
+
+def _elements(quantity: Quantity, values: Mapping[str, Value]) -> list[Value | None]:
+    """Values of its elements: of the whole, and of elements that are set by themselves."""
+    names = quantity.scalars()
+    whole: list[Value | None] = [None] * len(names)
+    if quantity.shape and quantity.name in values:
+        given = values[quantity.name].elements()
+        if len(given) not in (1, len(names)):
+            raise ConfigurationError(
+                f"'{quantity.name}' has {len(names)} elements, and its parameter set gives "
+                f"{len(given)}"
+            )
+        whole = [*given] * (len(names) // len(given)) if given else whole
+    elif quantity.name in values:
+        whole = [values[quantity.name]]
+    return [values.get(n, w) for n, w in zip(names, whole, strict=True)]
 
 
 def _text(name: str, value: Value) -> str:

@@ -17,7 +17,7 @@ from terrafix.cosim.basics.units import SI_BASE, unit_by_definition, unit_by_nam
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
 from terrafix.cosim.exchange.ssp.documents import read_document
 from terrafix.cosim.exchange.ssp.names import OSP, OWN, SSC, SSD, SSM, SSV, tag
-from terrafix.cosim.exchange.ssp.packages import Package, open_package
+from terrafix.cosim.exchange.ssp.packages import Package, open_package, proxied
 from terrafix.cosim.exchange.ssp.parameters import (
     Transformation,
     Value,
@@ -63,6 +63,7 @@ class Part:
     starts: dict[str, Value] = field(default_factory=dict)
     rate: Rate | None = None
     units: dict[str, str] = field(default_factory=dict)
+    isolate: bool = False
 
 
 @dataclass
@@ -144,11 +145,14 @@ class Gathering:
                 continue
             steps, origin, converted = [joint.step], joint.source, joint.keep_unit
             seen = {joint.target}
-            while origin[0] not in into.parts and origin in incoming and origin not in seen:
+            while origin[0] not in into.parts and origin not in seen:
                 seen.add(origin)
-                steps.append(incoming[origin].step)
-                converted &= incoming[origin].keep_unit
-                origin = incoming[origin].source
+                before = self._before(origin, incoming)
+                if before is None:
+                    break
+                steps.append(before.step)
+                converted &= before.keep_unit
+                origin = before.source
             factor, offset = self._linear(joint, steps)
             link = Link(origin, joint.target, factor, offset, converted)
             if origin[0] in into.parts:
@@ -159,12 +163,28 @@ class Gathering:
             if owner or kind != "output" or ("", name) not in incoming:
                 continue
             origin, seen = incoming["", name].source, set[End]()
-            while origin[0] not in into.parts and origin in incoming and origin not in seen:
+            while origin[0] not in into.parts and origin not in seen:
                 seen.add(origin)
-                origin = incoming[origin].source
+                before = self._before(origin, incoming)
+                origin = origin if before is None else before.source
             if origin[0] in into.parts:
                 into.outputs[name] = origin
         return into
+
+    def _before(self, end: End, incoming: Mapping[End, Joint]) -> Joint | None:
+        """What is connected to a connector of a system, or to the array of which it is an element."""
+        owner, name = end
+        whole, bracket, index = name.partition("[")
+        if end not in incoming and bracket and (owner, whole) in incoming:
+            joint = incoming[owner, whole]
+            return replace(joint, source=(joint.source[0], f"{joint.source[1]}[{index}"))
+        single = [n for o, n in incoming if o == owner and n.startswith(f"{name}[")]
+        if end not in incoming and single:
+            raise ConfigurationError(
+                f"'{self._file}' connects '{single[0]}' of a system, and all of '{name}' within\n"
+                "  terrafix follows arrays of systems whole: connect elements on both sides"
+            )
+        return incoming.get(end)
 
     def _linear(self, joint: Joint, steps: Sequence[Transformation]) -> tuple[float, float]:
         """Several transformations as one; the first is that of the last link."""
@@ -297,6 +317,8 @@ class Gathering:
                     f"'{self._file}' connects '{owner}.{connector}', but there is no '{owner}'\n"
                     f"  {nearest(owner, names, what='elements')}"
                 )
+            indices = (connection.get(f"{side}Indices") or "").split()
+            connector += f"[{','.join(indices)}]" if indices else ""
             ends.append((key if owner is None else names[owner], connector))
         known = [kinds.get(e) if e[0] != key else into.kinds.get(e) for e in ends]
         gives = [k is not None and k in _SOURCES[e[0] == key]
@@ -341,7 +363,8 @@ class Gathering:
                 f"'{self._file}': component '{name}' wants its FMU run by {wanted}; terrafix runs "
                 "CoSimulation and ModelExchange"
             )
-        part = Part(name, self._resource(source), _KINDS[wanted])
+        file = proxied(source)
+        part = Part(name, self._resource(file or source), _KINDS[wanted], isolate=file is not None)
         part.starts = self._values(element)
         for connector in _children(element, "Connectors", "Connector"):
             unit = next((c.get("unit") for c in connector if c.get("unit")), None)
@@ -379,7 +402,7 @@ class Gathering:
                         float(base.get(*a)) for a in (("factor", "1"), ("offset", "0"))
                     )
                     return unit_by_definition(name, factor, powers, offset)
-        return unit_by_name(name)
+        return unit_by_name(name.removeprefix("[").removesuffix("]"))
 
     def _values(self, element: ET.Element) -> dict[str, Value]:
         """Values that the bindings of an element give; the later overrule the earlier."""

@@ -78,10 +78,21 @@ def test_sources_beside_a_folder_but_not_beside_an_archive(tmp_path, fmus):
     assert list(read_system(tmp_path / "x.toml").nodes) == ["a"]
 
 
-def test_what_another_program_runs_is_named(tmp_path, fmus):
-    top = system('<ssd:Component name="a" source="proxyfmu://localhost?file=k.fmu"/>')
-    with pytest.raises(ConfigurationError, match=r"another program is to run \(proxyfmu\)"):
-        read_ssp(packaged(tmp_path / "x.ssp", fmus, top))
+def test_a_proxy_here_is_a_process_of_its_own_and_one_elsewhere_is_named(tmp_path, fmus):
+    """As packages of the Open Simulation Platform have it."""
+
+    def at(host):
+        given = bindings(bound(k="4"))
+        source = f"proxyfmu://{host}?file=k.fmu"
+        top = system(f'<ssd:Component name="a" source="{source}">{given}</ssd:Component>')
+        return packaged(tmp_path / "x.ssp", fmus, top)
+
+    assert read_ssp(at("localhost")).nodes["a"].given_parameters["isolate"]
+    assert values(at("localhost:9090"), "a.y") == [4.0]
+    with pytest.raises(
+        ConfigurationError, match=r"names 'proxyfmu://far\?.*', which lies elsewhere"
+    ):
+        read_ssp(at("far"))
 
 
 def held(source, kind="package", inside=""):

@@ -78,6 +78,20 @@ def test_text_that_is_connected_is_named(tmp_path, fmus):
         read_ssp(file)
 
 
+def test_one_side_without_a_unit_takes_the_number_as_it_is(tmp_path, fmus):
+    """3 m go to u, which has no unit: y = k + u = 4, and a note says so."""
+    top = system(part("a", inside=bindings(bound(length="3 m"))) + part("b"), link("a.far", "b.u"))
+    file = packaged(tmp_path / "x.ssp", fmus, top)
+    assert values(file, "b.y") == [4.0]
+    assert "'b.u' has no unit: taken as m, that of what it reads" in check(read_ssp(file)).notes
+
+
+def test_units_in_brackets_as_simulink_writes_them(tmp_path, fmus):
+    given = bound(length="2 m").replace('unit="m"', 'unit="[m]"')
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a", inside=bindings(given))))
+    assert values(file, "a.far") == [2.0]
+
+
 def test_mappings_inline_and_in_a_file(tmp_path, fmus):
     """length = 2 * 3 m + 0.5; mode by a table from 7 to 2; k, not mapped, is not applied.
 
