@@ -266,8 +266,8 @@ def in_slaves(archive: str, options: dict) -> dict:
     """FMPy's slaves, wired as terrafix reads the package and stepped by the two masters there are.
 
     Initial outputs are handed on until nothing changes. After each step outputs are handed on once,
-    or ("again") until nothing changes, and read after that: so what depends on an input at once is
-    a step ahead.
+    or ("again", as OMSimulator does) until nothing changes, and read after that: so what depends on
+    an input at once is a step ahead. Time is exact, or is summed up there.
     """
     import numpy as np
     from fmpy import extract, read_model_description
@@ -340,13 +340,14 @@ def in_slaves(archive: str, options: dict) -> dict:
         slave.exitInitializationMode()
     if options["again"]:
         settle()
-    step, rows = float(options["step"]), []
+    step, rows, t = Fraction(options["step"]), [], options["start"]
     shown = [("_".join(map(identifier, p)), n) for p, n, _ in connectors(archive)[1]]
-    for k in range(options["steps"]):
-        t = options["start"] + k * step
-        h = options["start"] + (k + 1) * step - t
+    for k in range(1, options["steps"] + 1):
+        later = t + float(step) if options["again"] else options["start"] + float(k * step)
+        h = later - t
         for slave in slaves.values():
             slave.doStep(t, h)
+        t = later
         if options["again"]:
             settle()
         rows.append([get(slaves[o], known[o][n]) for o, n in shown])

@@ -172,7 +172,7 @@ class Gathering:
         return into
 
     def _before(self, end: End, incoming: Mapping[End, Joint]) -> Joint | None:
-        """What is connected to a connector of a system, or to the array of which it is an element."""
+        """What is connected to a connector of a system, or to the array that it is in."""
         owner, name = end
         whole, bracket, index = name.partition("[")
         if end not in incoming and bracket and (owner, whole) in incoming:
