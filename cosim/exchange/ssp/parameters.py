@@ -79,9 +79,27 @@ def exact(text: str, where: str) -> Fraction:
         If it is none; `where` says whose it is.
     """
     try:
-        return Fraction(text.strip())
+        found = Fraction(text.strip())
+        float(found)
     except (ValueError, ZeroDivisionError):
         raise ConfigurationError(f"{where} is '{text}', which is no number") from None
+    except OverflowError:
+        raise ConfigurationError(f"{where} is '{text}', which is too large") from None
+    return found
+
+
+def integer(text: str, where: str) -> int:
+    """A whole number of a package.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is none; `where` says whose it is.
+    """
+    found = exact(text, where)
+    if found.denominator != 1:
+        raise ConfigurationError(f"{where} is '{text}', which is no whole number")
+    return int(found)
 
 
 def transformation(parent: ET.Element, where: str) -> Transformation:

@@ -30,7 +30,7 @@ from terrafix.cosim.exchange.ssp.elements import NOWHERE, Elements
 from terrafix.cosim.exchange.ssp.linear import Linear
 from terrafix.cosim.exchange.ssp.names import OWN, SSD, tag
 from terrafix.cosim.exchange.ssp.packages import Package, open_package, split_name
-from terrafix.cosim.exchange.ssp.parameters import exact, sizes_of, starts_of
+from terrafix.cosim.exchange.ssp.parameters import exact, integer, sizes_of, starts_of
 from terrafix.cosim.exchange.ssp.structure import (
     End,
     Gathering,
@@ -166,8 +166,8 @@ class _Reader:
             identifier(self.root.get("name") or self.file.stem),
             doc=self.top.get("description") or "",
             duration=self._duration(),
-            members=int(own.get("members", "1")) if own is not None else 1,
-            seed=int(own.get("seed", "0")) if own is not None else 0,
+            members=self._own_number(own, "members", "1"),
+            seed=self._own_number(own, "seed", "0"),
         )
         interfaces = {part.name: self._opened(part) for part in structure.parts.values()}
         structure.links = self._elementwise(structure.links, interfaces)
@@ -232,6 +232,10 @@ class _Reader:
                     if text:
                         return exact(text, f"'{self.file}': {name}").limit_denominator(10**9)
         return None
+
+    def _own_number(self, own: ET.Element | None, name: str, default: str) -> int:
+        text = default if own is None else own.get(name, default)
+        return integer(text, f"'{self.file}': {name} of its annotation")
 
     def _duration(self) -> Fraction | None:
         stop, start = self._experiment("stopTime"), self._experiment("startTime") or Fraction(0)

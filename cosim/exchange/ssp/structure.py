@@ -22,6 +22,7 @@ from terrafix.cosim.exchange.ssp.parameters import (
     Transformation,
     Value,
     exact,
+    integer,
     mapped,
     read_set,
     transformation,
@@ -88,6 +89,8 @@ class Structure:
         Elements of each system by name: components by their name here, systems by their key.
     kinds : dict of End to str
         Kinds of the connectors of systems.
+    steps_to : dict of End to int
+        Over how many connections the value of a component's variable came.
     links : list of Link
     inputs : dict of str to list of Link
         Readers of what the outermost system is given.
@@ -98,6 +101,7 @@ class Structure:
     joints: list[Joint] = field(default_factory=list)
     elements: dict[str, dict[str, str]] = field(default_factory=dict)
     kinds: dict[End, str] = field(default_factory=dict)
+    steps_to: dict[End, int] = field(default_factory=dict)
     links: list[Link] = field(default_factory=list)
     inputs: dict[str, list[Link]] = field(default_factory=dict)
     outputs: dict[str, End] = field(default_factory=dict)
@@ -337,9 +341,16 @@ class Gathering:
         value: Value,
         passed: frozenset[End] = frozenset(),
     ) -> None:
-        """Set what a hierarchical name means; what is set later overrules what was set before."""
+        """Set what a hierarchical name means.
+
+        What comes over a connection overrules what is set at its end, whatever sets it; else what
+        is set later overrules what was set before.
+        """
         if owner in into.parts:
-            into.parts[owner].starts[name] = value
+            before = into.steps_to.get((owner, name), 0)
+            if len(passed) >= before:
+                into.parts[owner].starts[name] = value
+                into.steps_to[owner, name] = len(passed)
             return
         for joint in into.joints:
             if joint.source == (owner, name) and joint.target not in passed:
@@ -397,9 +408,11 @@ class Gathering:
             for unit in () if units is None else units.findall(tag(SSC, "Unit")):
                 base = unit.find(tag(SSC, "BaseUnit"))
                 if unit.get("name") == name and base is not None and base.attrib:
-                    powers = {symbol: int(base.get(symbol, "0")) for symbol in SI_BASE}
+                    where = f"'{self._file}': BaseUnit of '{name}'"
+                    powers = {s: integer(base.get(s, "0"), f"{where}: {s}") for s in SI_BASE}
                     factor, offset = (
-                        float(base.get(*a)) for a in (("factor", "1"), ("offset", "0"))
+                        float(exact(base.get(n) or default, f"{where}: {n}"))
+                        for n, default in (("factor", "1"), ("offset", "0"))
                     )
                     return unit_by_definition(name, factor, powers, offset)
         return unit_by_name(name.removeprefix("[").removesuffix("]"))

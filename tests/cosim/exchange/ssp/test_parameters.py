@@ -78,6 +78,25 @@ def test_text_that_is_connected_is_named(tmp_path, fmus):
         read_ssp(file)
 
 
+def test_a_connection_overrules_what_is_set_at_its_end(tmp_path, fmus):
+    """a.k is connected to gain, 30, and B.a.k to inside and that to gain, also where k is set."""
+    own = bindings(bound(k="2"))
+    inner = system(
+        part("a", inside=own),
+        link("inside", "a.k"),
+        name="B",
+        before=connectors(inside="parameter"),
+    )
+    given = bindings(bound(gain="30", a__k="10", B__a__k="11", B__inside="12"), bound(a__k="13"))
+    top = system(
+        part("a", inside=own) + inner,
+        link("gain", "a.k"),
+        link("gain", "B.inside"),
+        before=connectors(gain="parameter") + given,
+    )
+    assert values(packaged(tmp_path / "x.ssp", fmus, top), "a.y", "B_a.y") == [30.0, 30.0]
+
+
 def test_one_side_without_a_unit_takes_the_number_as_it_is(tmp_path, fmus):
     """3 m go to u, which has no unit: y = k + u = 4, and a note says so."""
     top = system(part("a", inside=bindings(bound(length="3 m"))) + part("b"), link("a.far", "b.u"))
