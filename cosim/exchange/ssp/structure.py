@@ -249,7 +249,7 @@ class Gathering:
             raise ConfigurationError(
                 f"'{self._file}': more than {MOST_WITHIN} packages lie within each other"
             )
-        source = element.get("source") or ""
+        source = self._source(element)
         try:
             system = (
                 self._by_id(element, source.removeprefix("#"))
@@ -362,7 +362,7 @@ class Gathering:
 
     def _part(self, name: str, element: ET.Element, rate: ET.Element | None) -> Part:
         kind = element.get("type", "application/x-fmu-sharedlibrary")
-        source = element.get("source") or ""
+        source = self._source(element)
         if kind != "application/x-fmu-sharedlibrary":
             raise ConfigurationError(
                 f"'{self._file}': component '{name}' is of type {kind}; terrafix reads FMUs "
@@ -457,11 +457,18 @@ class Gathering:
         root, missing = read_document(self._resource(source), self._file)
         self.note_undeclared(source, missing)
         if root.tag != name:
-            raise ConfigurationError(
-                f"{where}: '{source}' is no {name.rpartition('}')[2]} of SSP 1.0"
-            )
+            raise ConfigurationError(f"{where}: '{source}' is no {name.rpartition('}')[2]} of SSP")
         check_version(self._file, source, root)
         return root
+
+    def _source(self, element: ET.Element) -> str:
+        source = element.get("source")
+        if not source:
+            raise ConfigurationError(
+                f"'{self._file}': component '{element.get('name')}' has no source: it is a design "
+                "that nobody implemented\n  name its FMU as its source"
+            )
+        return source
 
     def _resource(self, source: str) -> Path:
         return self._package.resource(source, self._base)
@@ -477,7 +484,7 @@ def described(file: Path, name: str, root: ET.Element) -> ET.Element:
     """
     top = root.find(tag(SSD, "System"))
     if root.tag != tag(SSD, "SystemStructureDescription") or top is None:
-        raise ConfigurationError(f"'{file}': {name} describes no system of SSP 1.0")
+        raise ConfigurationError(f"'{file}': {name} describes no system of SSP")
     check_version(file, name, root)
     return top
 

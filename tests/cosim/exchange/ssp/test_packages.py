@@ -5,12 +5,15 @@ from __future__ import annotations
 import zipfile
 
 import pytest
-from ssp_parts import bindings, bound, packaged, part, system, values
+from ssp_parts import bindings, bound, link, packaged, part, system, values
 
 from terrafix.cli import main
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
+from terrafix.cosim.exchange.fmi.run import archive
 from terrafix.cosim.exchange.ssp.reading import import_ssp, read_ssp
 from terrafix.cosim.files.readers import read_system
+
+SET = bindings('<ssd:ParameterBinding source="v.ssv"/>')
 
 
 def variant(k):
@@ -157,3 +160,50 @@ def test_the_command_line_takes_all_of_them(tmp_path, unpacked, variants, capsys
         main(["run", f"{variants}#C.ssd"])
     assert done.value.code == 2
     assert "it has B.ssd, SystemStructure.ssd" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("elements", "files", "message"),
+    [
+        (
+            '<ssd:Component name="a"/>',
+            {},
+            "component 'a' has no source: it is a design that nobody",
+        ),
+        (part("a", "none"), {}, "names 'none.fmu', which is not in it"),
+        (part("a", inside=SET), {}, "names 'v.ssv', which is not in it"),
+        (part("a", inside=SET), {"v.ssv": "<a"}, "v.ssv is damaged: unclosed token"),
+        (part("a", inside=SET), {"v.ssv": "<a/>"}, "'v.ssv' is no ParameterSet of SSP"),
+        (part("a", inside=SET), {"v.ssv": "<!DOCTYPE a><a/>"}, "v.ssv has a document type"),
+        (part("a"), {"../x": ""}, "it would write outside its folder, to '../x'"),
+        (part("a"), {"x": b"\0" * (5 << 20)}, "it unpacks to more than 0 GiB|unpacks to 0.0 GiB"),
+    ],
+)
+def test_bad_packages(tmp_path, fmus, elements, files, message, monkeypatch):
+    """One message each, that names the file; the last one unpacks to more than is allowed."""
+    monkeypatch.setattr(archive, "MOST_BYTES", 4 << 20)
+    file = packaged(tmp_path / "x.ssp", fmus, system(elements), **files)
+    with pytest.raises(ConfigurationError, match=message) as raised:
+        read_ssp(file)
+    assert str(file) in str(raised.value)
+    assert "terrafix-" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('factor="3"', 'factor="1e400"', "factor of its LinearTransformation is '1e400', which is"),
+        ('m="1"', 'm="x"', "BaseUnit of 'm': m is 'x', which is no number"),
+        ('m="1"', 'm="1.5"', "BaseUnit of 'm': m is '1.5', which is no whole number"),
+        ('factor="1"', 'factor="inf"', "BaseUnit of 'm': factor is 'inf', which is no number"),
+    ],
+)
+def test_numbers_that_are_none(tmp_path, fmus, old, new, message):
+    units = '<ssd:Units><ssc:Unit name="m"><ssc:BaseUnit m="1" factor="1"/></ssc:Unit></ssd:Units>'
+    unit = '<ssd:Connector name="y" kind="output"><ssc:Real unit="m"/></ssd:Connector>'
+    step = '<ssc:LinearTransformation factor="3"/>'
+    shown = f"<ssd:Connectors>{unit}</ssd:Connectors>"
+    top = system(part("a", inside=shown) + part("b"), link("a.y", "b.u", step)) + units
+    file = packaged(tmp_path / "x.ssp", fmus, top.replace(old, new))
+    with pytest.raises(ConfigurationError, match=message):
+        read_ssp(file)
