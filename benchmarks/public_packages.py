@@ -330,15 +330,17 @@ def in_slaves(archive: str, options: dict) -> dict:
                 return
             before = now
 
+    order = {name: k for k, name in enumerate(check(system).order)}
     if options["again"]:
         settle()
     else:
-        order = {name: k for k, name in enumerate(check(system).order)}
         wires.sort(key=lambda wire: order[wire[0].source[0]])
         for _ in range(30):
             hand_on(at_once=False)
-    for slave in slaves.values():
-        slave.exitInitializationMode()
+    for name in sorted(slaves, key=lambda name: order[name]):
+        slaves[name].exitInitializationMode()
+        if not options["again"]:  # what has ended its initialization reaches what has not
+            hand_on(at_once=False)
     settle()
     step, rows, t = Fraction(options["step"]), [], options["start"]
     shown = [("_".join(map(identifier, p)), n) for p, n, _ in connectors(archive)[1]]
