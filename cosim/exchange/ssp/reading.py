@@ -373,19 +373,20 @@ class _Reader:
             place = fmus[target[0]].scalar_names()[link.target[1]][1]
             word = f"{ends.index(end) + 1}:{element}"
             takes[place] = (word, link.factor * factor, link.offset)
-        port = fmus[target[0]].ports[target[1]].single
-        start = np.ravel(fmus[target[0]].ports[target[1]].default)
-        each = [takes.get(k, (NOWHERE, 1.0, float(start[k]))) for k in range(port.size)]
+        reader = fmus[target[0]].ports[target[1]]
+        one = reader.single
+        start = np.zeros(one.size) if reader.default is None else np.ravel(np.array(reader.default))
+        places = [takes.get(k, (NOWHERE, 1.0, float(start[k]))) for k in range(one.size)]
         sources = [fmus[owner].ports[name].single for owner, name in ends]
         made = Elements(
             rate=fmus[target[0]].rate,
-            shapes=";".join(",".join(map(str, one.fixed_shape)) for one in sources),
-            units=";".join(str(one.unit) for one in sources),
-            shape=",".join(map(str, port.fixed_shape)),
-            unit=str(port.unit),
-            take=",".join(word for word, _, _ in each),
-            factor=",".join(repr(factor) for _, factor, _ in each),
-            shift=",".join(repr(shift) for _, _, shift in each),
+            shapes=";".join(",".join(map(str, each.fixed_shape)) for each in sources),
+            units=";".join(str(each.unit) for each in sources),
+            shape=",".join(map(str, one.fixed_shape)),
+            unit=str(one.unit),
+            take=",".join(word for word, _, _ in places),
+            factor=",".join(repr(factor) for _, factor, _ in places),
+            shift=",".join(repr(shift) for _, _, shift in places),
         )
         name = f"elements_of_{target[0]}_{target[1]}"
         system.add(made, name)
