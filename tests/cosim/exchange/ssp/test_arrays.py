@@ -9,7 +9,8 @@ from ssp_parts import bindings, link, packaged, part, system, values
 
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
-from terrafix.cosim.exchange.ssp.reading import read_ssp
+from terrafix.cosim.exchange.ssp.reading import import_ssp, read_ssp
+from terrafix.cosim.files.readers import read_system
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +81,8 @@ def test_elements_go_to_elements(tmp_path, arrays):
     )
     file = packaged(tmp_path / "x.ssp", arrays, top, version="2.0")
     assert values(file, "b.y", t="0.1") == [1 * 6 + 2 * 1 + 3 * 2]
+    import_ssp(file, tmp_path / "x.toml")
+    assert read_system(tmp_path / "x.toml").nodes["elements_of_b_u"].take == "1:2,-,2:0"
     wrong = top.replace('endIndices="3"', 'endIndices="4"')
     file = packaged(tmp_path / "x.ssp", arrays, wrong, version="2.0")
     with pytest.raises(ConfigurationError, match=r"connects 'b.u\[4\]', but the FMU has no such"):
