@@ -33,6 +33,12 @@ def scratch_folder(what: str) -> Path:
     return Path(tempfile.mkdtemp(prefix=f"{what}-", dir=_root()))
 
 
+def shown(path: Path) -> str:
+    """A path for people: of what lies in such a folder its name there."""
+    inside = [k for k, part in enumerate(path.parts) if _NAME.match(part)]
+    return str(Path(*path.parts[inside[0] + 2 :])) if inside else str(path)
+
+
 @contextmanager
 def scratch(what: str) -> Iterator[Path]:
     """A new folder for a ``with`` block."""

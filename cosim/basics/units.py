@@ -52,7 +52,8 @@ def _define(match: re.Match[str]) -> str:
         _registry().define(f"{name} = [dimension_of_{name}]")
     else:
         shift = f"; offset: {float(offset)!r}" if offset else ""
-        _registry().define(f"{name} = {float(factor)!r} * {base or 'dimensionless'}{shift}")
+        times = f" * {base}" if base else ""  # Pint knows no dimension of "dimensionless" here
+        _registry().define(f"{name} = {float(factor)!r}{times}{shift}")
     return name
 
 

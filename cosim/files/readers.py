@@ -20,6 +20,8 @@ from terrafix.cosim.files.choices import Settings
 from terrafix.cosim.system.system import System
 
 GROUP = "terrafix.readers"
+UNPACKED = "SystemStructure.ssd"
+"""What makes a folder a system: it is read as this file in it would be."""
 
 
 def read_system(path: str | Path, settings: Settings = (), *, outside: bool = False) -> System:
@@ -28,6 +30,7 @@ def read_system(path: str | Path, settings: Settings = (), *, outside: bool = Fa
     Parameters
     ----------
     path : path
+        A folder is read as its ``SystemStructure.ssd``: an SSP package that was unpacked.
     settings : sequence of (str, str)
         ``("orbit.gravity", "j2")``, as ``--set`` gives them; applied after the file and its
         choices. Numbers without a unit are in the declared (SI) unit.
@@ -57,7 +60,7 @@ def _reader(path: Path) -> EntryPoint:
     """The one reader of files that end as this one does."""
     entries = entry_points(group=GROUP)
     known = [f".{e.name.lower()}" for e in entries]
-    suffix = path.suffix.lower()
+    suffix = (path / UNPACKED if (path / UNPACKED).is_file() else path).suffix.lower()
     if suffix not in known:
         if path.is_dir():
             raise ConfigurationError(f"'{path}' is a folder; name a system file (.toml) in it")

@@ -58,6 +58,7 @@ from terrafix.cosim.files.choices import (
     try_others,
 )
 from terrafix.cosim.files.loading import Load
+from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.check import check
 from terrafix.cosim.system.dispersion import KINDS, Dispersion
 from terrafix.cosim.system.system import System, checked_epoch
@@ -202,12 +203,16 @@ def _nested(
     if path.resolve() in [f.resolve() for f in load.files]:
         load.refuse(f"'{name}' is the system '{path}', which contains it\n  nest another file")
         return
+    settings = [(k, _text(v)) for k, v, _ in values]
     try:
-        inner, its_load = _load((*load.files, path), [(k, _text(v)) for k, v, _ in values])
+        if path.suffix.lower() == ".toml":
+            inner, its_load = _load((*load.files, path), settings)
+            load.include(its_load, name)
+        else:
+            inner = read_system(path, settings)
     except TerrafixError as error:
         load.problems.append(type(error)(f"'{name}': {error}"))
         return
-    load.include(its_load, name)
     if load.attempt(system.add, inner, name) is not None:
         load.broken.discard(name)
 

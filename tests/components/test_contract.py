@@ -60,7 +60,7 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
         "clearance_correct_radar",
     ),  # in filters/test_clearance
 }
-FOREIGN = {"fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
+FOREIGN = {"elements", "fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
 BASES = {  # of which types are made
     *("EnsembleCorrect", "FilterAcquisition", "FilterCorrect", "FilterEvaluation", "FilterMonitor"),
     *("FilterPredict", "FilterSensor", "FilterTruth", "NoisyComponent", "OnGround", "OnReference"),

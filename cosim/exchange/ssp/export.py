@@ -208,17 +208,8 @@ class _Writer:
             connections.append(connection)
         step = self._step()
         annotations = ET.SubElement(top, tag(SSD, "Annotations"))  # after Connections: OMSimulator
-        openmodelica = self._annotation(annotations, OPENMODELICA)
-        inside = ET.SubElement(openmodelica, tag(OMS, "Annotations"))
-        information = ET.SubElement(inside, tag(OMS, "SimulationInformation"))
-        ET.SubElement(
-            information,
-            tag(OMS, "FixedStepMaster"),
-            description="oms-ma",
-            stepSize=number(step),
-            absoluteTolerance="1e-4",
-            relativeTolerance="1e-4",
-        )
+        self._for_openmodelica(annotations, step)  # which reads the first annotation alone
+        self._for_terrafix(annotations)
         self._units(root)
         experiment = {"startTime": "0.0"}
         if self.system.duration is not None:
@@ -227,9 +218,36 @@ class _Writer:
         osp = self._annotation(ET.SubElement(default, tag(SSD, "Annotations")), OPEN_SIMULATION)
         algorithm = ET.SubElement(osp, tag(OSP, "Algorithm"))
         ET.SubElement(algorithm, tag(OSP, "FixedStepAlgorithm"), baseStepSize=number(step))
-        own = self._annotation(ET.SubElement(root, tag(SSD, "Annotations")), TERRAFIX)
+        ET.indent(root)
+        return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
+
+    def _for_openmodelica(self, annotations: ET.Element, step: float) -> None:
+        """The step size, as both of OMSimulator's readers look for it.
+
+        That in C++ reads what stands within, that in Python the attributes: of the solver that it
+        gives to components which name none.
+        """
+        inside = ET.SubElement(self._annotation(annotations, OPENMODELICA), tag(OMS, "Annotations"))
+        information = ET.SubElement(
+            inside,
+            tag(OMS, "SimulationInformation"),
+            name="oms_ma_default",
+            method="oms_ma",
+            fixedStepSize=number(step),
+        )
+        ET.SubElement(
+            information,
+            tag(OMS, "FixedStepMaster"),
+            description="oms-ma",
+            stepSize=number(step),
+            absoluteTolerance="1e-4",
+            relativeTolerance="1e-4",
+        )
+
+    def _for_terrafix(self, annotations: ET.Element) -> None:
+        """What SSP has no place for. It stands in the system: OMSimulator refuses it elsewhere."""
         element = ET.SubElement(
-            own,
+            self._annotation(annotations, TERRAFIX),
             tag(OWN, "System"),
             {
                 "schema": "terrafix-ssp/1",
@@ -239,12 +257,15 @@ class _Writer:
                 "master": "end-reads in order within a step, as the annotations of the FMUs say",
             },
         )
+        for path in self.paths:
+            rate = self.plan.flat.components[path].rate
+            assert rate is not None
+            attributes = {"component": _file_name(path)} | _rate(rate)
+            ET.SubElement(element, tag(OWN, "Rate"), attributes)
         for shown, leaf in self.exposed.items():  # not as connectors: ecos cannot follow those
             owner, _, port = leaf.rpartition(".")
             attributes = {"name": shown, "component": _file_name(owner), "port": port}
             ET.SubElement(element, tag(OWN, "Expose"), attributes)
-        ET.indent(root)
-        return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
 
     @staticmethod
     def _annotation(parent: ET.Element, kind: str) -> ET.Element:
@@ -281,13 +302,6 @@ class _Writer:
             bindings = ET.SubElement(element, tag(SSD, "ParameterBindings"))
             binding = ET.SubElement(bindings, tag(SSD, "ParameterBinding"))
             ET.SubElement(binding, tag(SSD, "ParameterValues")).append(values)
-        own = self._annotation(ET.SubElement(element, tag(SSD, "Annotations")), TERRAFIX)
-        rate = self.plan.flat.components[path].rate
-        assert rate is not None
-        ET.SubElement(own, tag(OWN, "Rate"), _rate(rate))
-        if rate.period is not None:
-            osp = self._annotation(element[-1], OPEN_SIMULATION)
-            ET.SubElement(osp, tag(OSP, "StepSizeHint"), value=number(self._step()))
         return element
 
     def _connector(

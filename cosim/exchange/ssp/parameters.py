@@ -42,17 +42,27 @@ class Value:
     Attributes
     ----------
     text : str
+        Of an array all elements, row by row.
     unit : str or None
     kind : str
-        Real, Integer, Boolean, String, Enumeration.
+        Real, Integer, Boolean, String, Enumeration; of SSP 2.0 also Float64, Int32, ...
     steps : tuple of Transformation
         Applied in the unit of what it is set to.
+    words : tuple of str
+        Elements, where they stand one by one.
     """
 
     text: str
     unit: str | None = None
     kind: str = "Real"
     steps: tuple[Transformation, ...] = ()
+    words: tuple[str, ...] = ()
+
+    def elements(self) -> list[Value]:
+        """One value for each element."""
+        one_by_one = self.kind in ("String", "Enumeration", "Binary")
+        words = self.words or ((self.text,) if one_by_one else self.text.split())
+        return [replace(self, text=word, words=()) for word in words]
 
     def through(self, step: Transformation, *, keep_unit: bool = True) -> Value:
         """The value after a transformation."""
@@ -69,9 +79,27 @@ def exact(text: str, where: str) -> Fraction:
         If it is none; `where` says whose it is.
     """
     try:
-        return Fraction(text.strip())
+        found = Fraction(text.strip())
+        float(found)
     except (ValueError, ZeroDivisionError):
         raise ConfigurationError(f"{where} is '{text}', which is no number") from None
+    except OverflowError:
+        raise ConfigurationError(f"{where} is '{text}', which is too large") from None
+    return found
+
+
+def integer(text: str, where: str) -> int:
+    """A whole number of a package.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is none; `where` says whose it is.
+    """
+    found = exact(text, where)
+    if found.denominator != 1:
+        raise ConfigurationError(f"{where} is '{text}', which is no whole number")
+    return int(found)
 
 
 def transformation(parent: ET.Element, where: str) -> Transformation:
@@ -108,26 +136,23 @@ def read_set(root: ET.Element, prefix: str) -> dict[str, Value]:
         if value is None:
             continue
         kind = value.tag.rpartition("}")[2]
-        text = value.get("value", "")
-        found[prefix + str(parameter.get("name"))] = Value(text, value.get("unit"), kind)
+        words = tuple(each.text or "" for each in value if each.tag == tag(SSV, "Value"))
+        text = value.get("value", words[0] if words else "")
+        name = prefix + str(parameter.get("name"))
+        found[name] = Value(text, value.get("unit"), kind, words=words)
     return found
 
 
 def mapped(values: Mapping[str, Value], mapping: ET.Element, where: str) -> dict[str, Value]:
-    """Values under the names that a parameter mapping gives them.
-
-    A name that the mapping does not mention stays as it is; one that it does may have several.
-    """
+    """Values under the names that a parameter mapping gives them: one may have several, or none."""
     found: dict[str, Value] = {}
-    named: set[str] = set()
     for entry in mapping.iter(tag(SSM, "MappingEntry")):
         source, target = str(entry.get("source")), str(entry.get("target"))
-        named.add(source)
         if source in values:
             keep = entry.get("suppressUnitConversion", "false") not in ("true", "1")
             step = transformation(entry, f"{where}: the mapping of '{source}'")
             found[target] = values[source].through(step, keep_unit=keep)
-    return {n: v for n, v in values.items() if n not in named} | found
+    return found
 
 
 # --------------------------------------------------------------------------------- start values
@@ -146,7 +171,7 @@ def starts_of(fmu: Fmu, values: Mapping[str, Value]) -> dict[str, Any]:
     }
     for quantity in fmu.settable().values():
         names = quantity.scalars()
-        given = [values.get(n) for n in names]
+        given = _elements(quantity, values)
         if all(g is None for g in given):
             continue
         numbers: list[float | int] = []
@@ -164,6 +189,32 @@ def starts_of(fmu: Fmu, values: Mapping[str, Value]) -> dict[str, Any]:
     return starts
 
 
+def sizes_of(fmu: Fmu, values: Mapping[str, Value]) -> dict[str, Any]:
+    """Of what ``start`` is given the structural parameters: they give the others their shapes."""
+    structural = [
+        n for n, q in fmu.interface.parameters.items() if q.causality == "structuralParameter"
+    ]
+    sizes = {n: values[n] for n in structural if n in values}
+    return {n: v for n, v in starts_of(fmu, sizes).items() if n in sizes} if sizes else {}
+
+
+def _elements(quantity: Quantity, values: Mapping[str, Value]) -> list[Value | None]:
+    """Values of its elements: of the whole, and of elements that are set by themselves."""
+    names = quantity.scalars()
+    whole: list[Value | None] = [None] * len(names)
+    if quantity.shape and quantity.name in values:
+        given = values[quantity.name].elements()
+        if len(given) not in (1, len(names)):
+            raise ConfigurationError(
+                f"'{quantity.name}' has {len(names)} elements, and its parameter set gives "
+                f"{len(given)}"
+            )
+        whole = [*given] * (len(names) // len(given)) if given else whole
+    elif quantity.name in values:
+        whole = [values[quantity.name]]
+    return [values.get(n, w) for n, w in zip(names, whole, strict=True)]
+
+
 def _text(name: str, value: Value) -> str:
     if any(step.factor != 1.0 or step.offset for step in value.steps):
         raise ConfigurationError(f"'{name}' is text; a linear transformation is of numbers")
@@ -179,7 +230,7 @@ def _number(name: str, value: Value, quantity: Quantity, k: int) -> float | int:
     tables = [step.table for step in value.steps if step.table]
     if tables:
         for table in tables:
-            text = _looked_up(name, text, table)
+            text = _looked_up(text, table)
         return _plain(name, text, quantity)
     number = _plain(name, text, quantity)
     unit = (
@@ -200,14 +251,12 @@ def _same_unit(given: str, own: str) -> bool:
     return given == own or (given.endswith(UNDEFINED) and unit_label(given) == unit_label(own))
 
 
-def _looked_up(name: str, text: str, table: Sequence[tuple[str, str]]) -> str:
+def _looked_up(text: str, table: Sequence[tuple[str, str]]) -> str:
+    """What a table makes of a value; what it does not list stays as it is."""
     for source, target in table:
         if text == source or _same(text, source):
             return target
-    raise ConfigurationError(
-        f"'{name}' is {text}, which its mapping does not list; it lists "
-        f"{', '.join(source for source, _ in table)}"
-    )
+    return text
 
 
 def _same(a: str, b: str) -> bool:

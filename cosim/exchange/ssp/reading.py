@@ -12,29 +12,32 @@ import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from xml.etree import ElementTree as ET
+
+import numpy as np
 
 from terrafix.cosim.basics.clock import Rate, seconds
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError, nearest
 from terrafix.cosim.basics.files import write_atomically
 from terrafix.cosim.basics.scratch import scratch_folder
 from terrafix.cosim.basics.units import UNDEFINED, conversion_factor
-from terrafix.cosim.exchange.fmi.run.archive import unpack
 from terrafix.cosim.exchange.fmi.run.component import Fmu
 from terrafix.cosim.exchange.ssp.documents import read_document
+from terrafix.cosim.exchange.ssp.elements import NOWHERE, Elements
 from terrafix.cosim.exchange.ssp.linear import Linear
 from terrafix.cosim.exchange.ssp.names import OWN, SSD, tag
-from terrafix.cosim.exchange.ssp.parameters import exact, starts_of
+from terrafix.cosim.exchange.ssp.packages import Package, open_package, split_name
+from terrafix.cosim.exchange.ssp.parameters import exact, integer, sizes_of, starts_of
 from terrafix.cosim.exchange.ssp.structure import (
-    STRUCTURE,
     End,
     Gathering,
     Link,
     Part,
     Structure,
-    check_version,
+    described,
     identifier,
 )
 from terrafix.cosim.files.choices import Settings
@@ -54,6 +57,8 @@ def read_ssp(
     Parameters
     ----------
     path : path
+        An archive (``x.ssp``), a folder with ``SystemStructure.ssd``, or a description in one;
+        ``x.ssp#B.ssd`` is the description of that name in it.
     settings : sequence of (str, str)
         Step sizes alone: ``("rate", "100 Hz")`` for components without one, ``("a.rate", ...)``.
     outside : bool
@@ -66,26 +71,17 @@ def read_ssp(
     ConfigurationError
         If it is no package, damaged, unsafe, or uses what terrafix does not read; or for settings.
     """
-    file = Path(path)
-    rates = _rates(file, settings)
-    if not file.is_file():
-        raise ConfigurationError(f"there is no SSP package '{path}'")
-    unpacked = folder
-    if unpacked is None:
-        unpacked = scratch_folder("ssp")
-    unpack(file, unpacked, "SSP package")
-    document = unpacked / STRUCTURE
-    if not document.is_file():
-        raise ConfigurationError(f"'{file}' is no SSP package: it has no {STRUCTURE} at its top")
-    root, missing = read_document(document, file)
-    top = root.find(tag(SSD, "System"))
-    if root.tag != tag(SSD, "SystemStructureDescription") or top is None:
-        raise ConfigurationError(f"'{file}': {STRUCTURE} describes no system of SSP 1.0")
-    check_version(file, STRUCTURE, root)
-    gathering = Gathering(file, unpacked, root)
-    gathering.note_undeclared(STRUCTURE, missing)
+    rates = _rates(Path(path), settings)
+    into = scratch_folder("ssp") if folder is None else folder
+    file, chosen = split_name(Path(path))
+    package = open_package(file, into, chosen)
+    name = package.document.name
+    root, missing = read_document(package.document, package.file)
+    top = described(package.file, name, root)
+    gathering = Gathering(package, into, root)
+    gathering.note_undeclared(name, missing)
     structure = gathering.structure(top)
-    system = _Reader(file, unpacked, root, top, rates).system(structure)
+    system = _Reader(package, root, top, rates).system(structure)
     system.notes += gathering.notes
     return system
 
@@ -123,7 +119,9 @@ def import_ssp(path: str | Path, target: Path, settings: Settings = ()) -> Path:
         )
     folder.mkdir()
     try:
-        text = system_text(read_ssp(path, settings, folder=folder))
+        system = read_ssp(path, settings, folder=folder)
+        _collect(system, folder)
+        text = system_text(system)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -132,16 +130,32 @@ def import_ssp(path: str | Path, target: Path, settings: Settings = ()) -> Path:
     return folder
 
 
+def _collect(system: System, folder: Path) -> None:
+    """Copy FMUs that lie elsewhere, those of a package that is a folder."""
+    copies: dict[str, Path] = {}
+    for fmu in (n for n in system.nodes.values() if isinstance(n, Fmu)):
+        file = Path(fmu.given_parameters["file"])
+        if file.is_relative_to(folder.resolve()):
+            continue
+        if str(file) not in copies:
+            target, k = folder.resolve() / file.name, 1
+            while target.exists():
+                target, k = folder.resolve() / f"{file.stem}_{k + 1}{file.suffix}", k + 1
+            shutil.copyfile(file, target)
+            copies[str(file)] = target
+        fmu.file = copies[str(file)]
+
+
 class _Reader:
     def __init__(
         self,
-        file: Path,
-        folder: Path,
+        package: Package,
         root: ET.Element,
         top: ET.Element,
         rates: Mapping[str, Rate],
     ) -> None:
-        self.file, self.folder, self.root, self.top = file, folder, root, top
+        self.file, self.root, self.top = package.file, root, top
+        self.folder = package.root
         self._rates = rates
 
     def system(self, structure: Structure) -> System:
@@ -152,10 +166,13 @@ class _Reader:
             identifier(self.root.get("name") or self.file.stem),
             doc=self.top.get("description") or "",
             duration=self._duration(),
-            members=int(own.get("members", "1")) if own is not None else 1,
-            seed=int(own.get("seed", "0")) if own is not None else 0,
+            members=self._own_number(own, "members", "1"),
+            seed=self._own_number(own, "seed", "0"),
         )
-        scalars = self._scalar_parts(structure)
+        interfaces = {part.name: self._opened(part) for part in structure.parts.values()}
+        structure.links = self._elementwise(structure.links, interfaces)
+        grouped = _grouped(structure.links, interfaces).items()
+        scalars = {end[0] for ends, whole in grouped if not whole for end in ends}
         fmus: dict[str, Fmu] = {}
         for name in self._rates:
             if name and name not in structure.parts:
@@ -164,8 +181,10 @@ class _Reader:
                     f"  {nearest(name, structure.parts, what='components')}"
                 )
         for part in structure.parts.values():
-            made = self._fmu(part, base, arrays=part.name not in scalars)
-            fmus[part.name] = system.add(made, part.name)
+            fmus[part.name] = self._fmu(part, base, arrays=part.name not in scalars)
+        system.notes += _lend_units(structure.links, fmus)
+        for name, made in fmus.items():
+            system.add(made, name)
         self._connect(system, structure, fmus)
         self._expose(system, structure, fmus)
         for name, fmu in fmus.items():
@@ -214,6 +233,10 @@ class _Reader:
                         return exact(text, f"'{self.file}': {name}").limit_denominator(10**9)
         return None
 
+    def _own_number(self, own: ET.Element | None, name: str, default: str) -> int:
+        text = default if own is None else own.get(name, default)
+        return integer(text, f"'{self.file}': {name} of its annotation")
+
     def _duration(self) -> Fraction | None:
         stop, start = self._experiment("stopTime"), self._experiment("startTime") or Fraction(0)
         if stop is not None and stop <= start:
@@ -233,16 +256,8 @@ class _Reader:
     # ------------------------------------------------------------------ components
 
     def _fmu(self, part: Part, base: Fraction | None, *, arrays: bool) -> Fmu:
-        start = self._experiment("startTime") or Fraction(0)
-        made = Fmu(
-            file=part.source,
-            arrays=arrays,
-            kind=part.kind,
-            start_time=float(start),
-        )
-        made.name = part.name
+        made = self._opened(part, arrays=arrays)
         with self._telling(part):
-            made.prepare()
             given = self._rates.get(part.name) or part.rate
             rate = given or (Rate(base) if base is not None else None) or made.rate
             made.rate = rate or self._rates.get("")
@@ -266,21 +281,44 @@ class _Reader:
             text = str(error).replace(f"{self.folder.resolve()}{os.sep}", "")
             raise type(error)(f"'{self.file}': '{part.name}': {text}") from error
 
-    def _scalar_parts(self, structure: Structure) -> set[str]:
-        """Components of which single elements of an array are connected."""
-        found: set[str] = set()
-        interfaces: dict[str, Fmu] = {}
-        for part in structure.parts.values():
-            interfaces[part.name] = Fmu(file=part.source, kind=part.kind)
-            with self._telling(part):
-                interfaces[part.name].prepare()
-        for ends, whole in _grouped(structure.links, interfaces).items():
-            if not whole:
-                found |= {ends[0][0], ends[1][0]}
+    def _opened(self, part: Part, *, arrays: bool = True) -> Fmu:
+        """A component with the sizes that the package gives its arrays."""
+        start = self._experiment("startTime") or Fraction(0)
+        made = Fmu(
+            file=part.source,
+            arrays=arrays,
+            kind=part.kind,
+            start_time=float(start),
+            isolate=part.isolate,
+        )
+        made.name = part.name
+        with self._telling(part):
+            made.prepare()
+            if sizes := sizes_of(made, part.starts):
+                made.start = sizes
+                made.prepare()
+        return made
+
+    def _elementwise(self, links: Sequence[Link], fmus: Mapping[str, Fmu]) -> list[Link]:
+        """Connections of whole arrays as those of their elements."""
+        found = []
+        for link in links:
+            sides = [_elements(fmus[e[0]], e[1]) for e in (link.source, link.target)]
+            if len(sides[0]) != len(sides[1]):
+                (a, b), (m, n) = (".".join(link.source), ".".join(link.target)), map(len, sides)
+                raise ConfigurationError(
+                    f"'{self.file}' connects '{a}' to '{b}', but one has {m} "
+                    f"element{'s' * (m > 1)} and the other {n}\n"
+                    "  connect arrays of one shape, or one element: startIndices, endIndices"
+                )
+            found += [
+                replace(link, source=(link.source[0], one), target=(link.target[0], other))
+                for one, other in zip(*sides, strict=True)
+            ]
         return found
 
     def _connect(self, system: System, structure: Structure, fmus: Mapping[str, Fmu]) -> None:
-        links: dict[tuple[End, End], list[Link]] = defaultdict(list)
+        links: dict[End, list[Link]] = defaultdict(list)
         for link in structure.links:
             ports = [_port_of(fmus[e[0]], e[1]) for e in (link.source, link.target)]
             for end, port in zip((link.source, link.target), ports, strict=True):
@@ -295,15 +333,66 @@ class _Reader:
                         f"'{self.file}' connects '{end[0]}.{end[1]}', but the FMU has no such "
                         f"variable\n  {nearest(end[1], fmus[end[0]].scalar_names())}"
                     )
-            key = ((link.source[0], str(ports[0])), (link.target[0], str(ports[1])))
-            links[key].append(link)
-        for (source, target), members in links.items():
-            a, b = ".".join(source), ".".join(target)
-            gains = {(m.factor, m.offset, m.converted) for m in members}
-            if gains == {(1.0, 0.0, True)}:
-                system.connect(a, b)
+            links[link.target[0], str(ports[1])].append(link)
+        for target, members in links.items():
+            ((_, source), whole), *others = (
+                (ends[::-1], w) for ends, w in _grouped(members, fmus).items()
+            )
+            if others or not whole:
+                self._gather(system, fmus, target, members)
                 continue
-            self._transform(system, fmus, source, target, members)
+            gains = {(m.factor, m.offset, m.converted) for m in members}
+            units = [_plain_unit(fmus[e[0]], e[1]) for e in (source, target)]
+            one_has_none = None not in units and units[0] != units[1] and "1" in units
+            if gains == {(1.0, 0.0, True)} and not one_has_none:
+                system.connect(".".join(source), ".".join(target))
+            else:
+                self._transform(system, fmus, source, target, members)
+
+    def _gather(
+        self, system: System, fmus: Mapping[str, Fmu], target: End, members: Sequence[Link]
+    ) -> None:
+        """Put single elements of arrays together, of one source or several."""
+        ends: list[End] = []
+        takes: dict[int, tuple[str, float, float]] = {}
+        unit = _plain_unit(fmus[target[0]], target[1])
+        for link in members:
+            source = fmus[link.source[0]]
+            port, element = source.scalar_names()[link.source[1]]
+            end = (link.source[0], port)
+            theirs = _plain_unit(source, port)
+            if theirs is None or unit is None:
+                raise ConfigurationError(
+                    f"'{self.file}' connects single elements of '{'.'.join(end)}' to "
+                    f"'{'.'.join(target)}'; terrafix does so for plain signals of one unit"
+                )
+            ends += [end] * (end not in ends)
+            factor = 1.0
+            if link.converted and theirs != unit and _converts(theirs, unit):
+                factor = conversion_factor(theirs, unit) or 1.0
+            place = fmus[target[0]].scalar_names()[link.target[1]][1]
+            word = f"{ends.index(end) + 1}:{element}"
+            takes[place] = (word, link.factor * factor, link.offset)
+        reader = fmus[target[0]].ports[target[1]]
+        one = reader.single
+        start = np.zeros(one.size) if reader.default is None else np.ravel(np.array(reader.default))
+        places = [takes.get(k, (NOWHERE, 1.0, float(start[k]))) for k in range(one.size)]
+        sources = [fmus[owner].ports[name].single for owner, name in ends]
+        made = Elements(
+            rate=fmus[target[0]].rate,
+            shapes=";".join(",".join(map(str, each.fixed_shape)) for each in sources),
+            units=";".join(str(each.unit) for each in sources),
+            shape=",".join(map(str, one.fixed_shape)),
+            unit=str(one.unit),
+            take=",".join(word for word, _, _ in places),
+            factor=",".join(repr(factor) for _, factor, _ in places),
+            shift=",".join(repr(shift) for _, _, shift in places),
+        )
+        name = f"elements_of_{target[0]}_{target[1]}"
+        system.add(made, name)
+        for k, end in enumerate(ends):
+            system.connect(".".join(end), f"{name}.x{k + 1}")
+        system.connect(f"{name}.y", ".".join(target))
 
     def _transform(
         self,
@@ -343,8 +432,17 @@ class _Reader:
 
 
 def _port_of(fmu: Fmu, connector: str) -> str | None:
-    found = fmu.scalar_names().get(connector)
+    found = fmu.scalar_names().get(_elements(fmu, connector)[0])
     return None if found is None else found[0]
+
+
+def _elements(fmu: Fmu, connector: str) -> list[str]:
+    """The elements of an array of this name; else the name itself."""
+    for port in fmu.interface.ports:
+        for quantity, _ in port.fields.values():
+            if quantity.name == connector and quantity.size:
+                return quantity.scalars()
+    return [connector]
 
 
 def _grouped(links: Sequence[Link], fmus: Mapping[str, Fmu]) -> dict[tuple[End, End], bool]:
@@ -372,6 +470,35 @@ def _converts(source: str, target: str) -> bool:
         return conversion_factor(source, target) is not None
     except ConfigurationError:
         return False
+
+
+def _lend_units(links: Sequence[Link], fmus: Mapping[str, Fmu]) -> list[str]:
+    """Give outputs, then inputs, that have no unit that of the other side; notes say which."""
+    notes: list[str] = []
+    for side, other in (("source", "target"), ("target", "source")):
+        wanted: dict[End, set[str]] = defaultdict(set)
+        for link in (each for each in links if each.converted):
+            mine, theirs = getattr(link, side), getattr(link, other)
+            end = (mine[0], str(_port_of(fmus[mine[0]], mine[1])))
+            unit = _plain_unit(fmus[theirs[0]], str(_port_of(fmus[theirs[0]], theirs[1])))
+            if unit not in (None, "1") and _plain_unit(fmus[end[0]], end[1]) == "1":
+                wanted[end].add(str(unit))
+        for (owner, port), units in wanted.items():
+            if len(units) == 1:
+                (unit,) = units
+                fmus[owner].units = fmus[owner].given_parameters["units"] | {port: unit}
+                fmus[owner].prepare()
+                what = "what reads it" if side == "source" else "what it reads"
+                notes.append(f"'{owner}.{port}' has no unit: taken as {unit}, that of {what}")
+    return notes
+
+
+def _plain_unit(fmu: Fmu, port: str) -> str | None:
+    """The unit of a plain signal."""
+    found = fmu.ports.get(port)
+    if found is None or found.is_bundle or found.kind != "signal":
+        return None
+    return found.single.unit if isinstance(found.single.unit, str) else None
 
 
 def _units(fmu: Fmu, connectors: Mapping[str, str]) -> dict[str, str]:

@@ -9,28 +9,27 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.basics.units import SI_BASE, unit_by_definition, unit_by_name
-from terrafix.cosim.exchange.fmi.run.archive import unpack
 from terrafix.cosim.exchange.fmi.run.binding import CO_SIMULATION, MODEL_EXCHANGE
 from terrafix.cosim.exchange.ssp.documents import read_document
 from terrafix.cosim.exchange.ssp.names import OSP, OWN, SSC, SSD, SSM, SSV, tag
+from terrafix.cosim.exchange.ssp.packages import Package, open_package, proxied
 from terrafix.cosim.exchange.ssp.parameters import (
     Transformation,
     Value,
     exact,
+    integer,
     mapped,
     read_set,
     transformation,
 )
 
-STRUCTURE = "SystemStructure.ssd"
 MOST_WITHIN = 10
-_SYSTEM_TYPES = ("application/x-ssp-package", "application/x-ssp-definition")
+PACKAGE, DEFINITION = "application/x-ssp-package", "application/x-ssp-definition"
 VERSIONS = ("1.", "2.0")
 _KINDS = {"any": "auto", "CoSimulation": CO_SIMULATION, "ModelExchange": MODEL_EXCHANGE}
 _SOURCES = {True: ("input", "parameter", "inout"), False: ("output", "calculatedParameter")}
@@ -65,6 +64,7 @@ class Part:
     starts: dict[str, Value] = field(default_factory=dict)
     rate: Rate | None = None
     units: dict[str, str] = field(default_factory=dict)
+    isolate: bool = False
 
 
 @dataclass
@@ -89,6 +89,8 @@ class Structure:
         Elements of each system by name: components by their name here, systems by their key.
     kinds : dict of End to str
         Kinds of the connectors of systems.
+    steps_to : dict of End to int
+        Over how many connections the value of a component's variable came.
     links : list of Link
     inputs : dict of str to list of Link
         Readers of what the outermost system is given.
@@ -99,6 +101,7 @@ class Structure:
     joints: list[Joint] = field(default_factory=list)
     elements: dict[str, dict[str, str]] = field(default_factory=dict)
     kinds: dict[End, str] = field(default_factory=dict)
+    steps_to: dict[End, int] = field(default_factory=dict)
     links: list[Link] = field(default_factory=list)
     inputs: dict[str, list[Link]] = field(default_factory=dict)
     outputs: dict[str, End] = field(default_factory=dict)
@@ -109,10 +112,9 @@ class Gathering:
 
     Parameters
     ----------
-    file : Path
-        For messages.
-    folder : Path
-        Where it was unpacked.
+    package : Package
+    into : Path
+        Where packages within are unpacked.
     root : Element
         Of its description.
 
@@ -122,9 +124,10 @@ class Gathering:
         What is remarkable about it.
     """
 
-    def __init__(self, file: Path, folder: Path, root: ET.Element) -> None:
+    def __init__(self, package: Package, into: Path, root: ET.Element) -> None:
         self.notes: list[str] = []
-        self._file, self._folder = file, folder
+        self._file, self._into = package.file, into
+        self._package, self._base = package, package.document.parent
         self._units_of = root  # whose units are meant
         self._within: list[str] = []
 
@@ -146,11 +149,14 @@ class Gathering:
                 continue
             steps, origin, converted = [joint.step], joint.source, joint.keep_unit
             seen = {joint.target}
-            while origin[0] not in into.parts and origin in incoming and origin not in seen:
+            while origin[0] not in into.parts and origin not in seen:
                 seen.add(origin)
-                steps.append(incoming[origin].step)
-                converted &= incoming[origin].keep_unit
-                origin = incoming[origin].source
+                before = self._before(origin, incoming)
+                if before is None:
+                    break
+                steps.append(before.step)
+                converted &= before.keep_unit
+                origin = before.source
             factor, offset = self._linear(joint, steps)
             link = Link(origin, joint.target, factor, offset, converted)
             if origin[0] in into.parts:
@@ -161,12 +167,28 @@ class Gathering:
             if owner or kind != "output" or ("", name) not in incoming:
                 continue
             origin, seen = incoming["", name].source, set[End]()
-            while origin[0] not in into.parts and origin in incoming and origin not in seen:
+            while origin[0] not in into.parts and origin not in seen:
                 seen.add(origin)
-                origin = incoming[origin].source
+                before = self._before(origin, incoming)
+                origin = origin if before is None else before.source
             if origin[0] in into.parts:
                 into.outputs[name] = origin
         return into
+
+    def _before(self, end: End, incoming: Mapping[End, Joint]) -> Joint | None:
+        """What is connected to a connector of a system, or to the array that it is in."""
+        owner, name = end
+        whole, bracket, index = name.partition("[")
+        if end not in incoming and bracket and (owner, whole) in incoming:
+            joint = incoming[owner, whole]
+            return replace(joint, source=(joint.source[0], f"{joint.source[1]}[{index}"))
+        single = [n for o, n in incoming if o == owner and n.startswith(f"{name}[")]
+        if end not in incoming and single:
+            raise ConfigurationError(
+                f"'{self._file}' connects '{single[0]}' of a system, and all of '{name}' within\n"
+                "  terrafix follows arrays of systems whole: connect elements on both sides"
+            )
+        return incoming.get(end)
 
     def _linear(self, joint: Joint, steps: Sequence[Transformation]) -> tuple[float, float]:
         """Several transformations as one; the first is that of the last link."""
@@ -185,6 +207,7 @@ class Gathering:
         kinds: dict[End, str] = {}
         for connector in _children(system, "Connectors", "Connector"):
             into.kinds[key, str(connector.get("name"))] = str(connector.get("kind"))
+        rates = {r.get("component"): r for r in _own(system, "Rate")}
         elements = system.find(tag(SSD, "Elements"))
         for element in elements if elements is not None else ():
             kind = element.tag.rpartition("}")[2]
@@ -195,12 +218,12 @@ class Gathering:
                     "  rename one of them"
                 )
             full = self._free(f"{prefix}{name}", into)
-            if kind == "Component" and element.get("type") in _SYSTEM_TYPES:
+            if kind == "Component" and element.get("type") in (PACKAGE, DEFINITION):
                 names[name] = f"system {full}"
                 self._gather_within(element, names[name], f"{full}_", into)
             elif kind == "Component":
                 names[name] = full
-                into.parts[full] = self._part(full, element)
+                into.parts[full] = self._part(full, element, rates.get(name))
             elif kind == "System":
                 names[name] = f"system {full}"
                 self._gather(element, names[name], f"{full}_", into)
@@ -221,34 +244,54 @@ class Gathering:
         What is bound to the component overrules what is bound to that system.
         """
         given = self._values(element)
-        source, folder = self._resource(element.get("source") or ""), self._folder
-        outer = self._units_of
+        outer = self._package, self._base, self._units_of
         if len(self._within) >= MOST_WITHIN:
             raise ConfigurationError(
                 f"'{self._file}': more than {MOST_WITHIN} packages lie within each other"
             )
-        document = source
-        if element.get("type") == _SYSTEM_TYPES[0]:
-            self._folder = folder / f"{prefix}package"
-            unpack(source, self._folder, "SSP package")
-            document = self._folder / STRUCTURE
+        source = self._source(element)
         try:
-            if not document.is_file():
-                raise ConfigurationError(f"'{self._file}': '{source.name}' has no {STRUCTURE}")
-            root, missing = read_document(document, self._file)
-            self.note_undeclared(document.name, missing)
-            check_version(self._file, document.name, root)
-            system = root.find(tag(SSD, "System"))
-            if system is None:
-                raise ConfigurationError(f"'{self._file}': '{source.name}' describes no system")
+            system = (
+                self._by_id(element, source.removeprefix("#"))
+                if source.startswith("#")
+                else self._inner(element, source, f"{prefix}package")
+            )
             self._within.append(key)
-            self._units_of = root
             self._gather(system, key, prefix, into)
             self._within.pop()
         finally:
-            self._folder, self._units_of = folder, outer
+            self._package, self._base, self._units_of = outer
         for name, value in given.items():
             self._set(into, key, name, value)
+
+    def _inner(self, element: ET.Element, source: str, folder: str) -> ET.Element:
+        """The system of the description that a component refers to, which is read from now on."""
+        named, _, description = source.partition("#")
+        document = file = self._resource(named)
+        if element.get("type") == PACKAGE:
+            try:
+                inner = open_package(file, self._into / folder, description)
+            except ConfigurationError as error:
+                text = str(error).replace(str(file), named)
+                raise ConfigurationError(
+                    f"'{self._file}': '{element.get('name')}': {text}"
+                ) from error
+            self._package, document = replace(inner, file=self._file), inner.document
+        root, missing = read_document(document, self._file)
+        self.note_undeclared(document.name, missing)
+        self._base, self._units_of = document.parent, root
+        return described(self._file, document.name, root)
+
+    def _by_id(self, element: ET.Element, wanted: str) -> ET.Element:
+        """Another system of the same document."""
+        for system in self._units_of.iter(tag(SSD, "System")):
+            if system.get("id") == wanted:
+                return system
+        ids = [i for s in self._units_of.iter(tag(SSD, "System")) if (i := s.get("id"))]
+        raise ConfigurationError(
+            f"'{self._file}': '{element.get('name')}' is to be the system with the id '{wanted}'\n"
+            f"  {nearest(wanted, ids, what='ids of systems')}"
+        )
 
     @staticmethod
     def _free(name: str, into: Structure) -> str:
@@ -278,6 +321,8 @@ class Gathering:
                     f"'{self._file}' connects '{owner}.{connector}', but there is no '{owner}'\n"
                     f"  {nearest(owner, names, what='elements')}"
                 )
+            indices = (connection.get(f"{side}Indices") or "").split()
+            connector += f"[{','.join(indices)}]" if indices else ""
             ends.append((key if owner is None else names[owner], connector))
         known = [kinds.get(e) if e[0] != key else into.kinds.get(e) for e in ends]
         gives = [k is not None and k in _SOURCES[e[0] == key]
@@ -296,25 +341,28 @@ class Gathering:
         value: Value,
         passed: frozenset[End] = frozenset(),
     ) -> None:
-        """Set what a hierarchical name means; what is set later overrules what was set before."""
-        readers = [j for j in into.joints if j.source == (owner, name)]
-        if owner in into.parts:
-            into.parts[owner].starts[name] = value
-        elif (owner, name) in into.kinds or readers:
-            for joint in readers:
-                if joint.target not in passed:
-                    there = value.through(joint.step, keep_unit=joint.keep_unit)
-                    self._set(into, *joint.target, there, passed | {joint.target})
-        else:
-            elements = into.elements.get(owner, {})
-            inside = [e for e in elements if name.startswith(f"{e}.")]
-            if inside:
-                element = max(inside, key=len)
-                self._set(into, elements[element], name[len(element) + 1 :], value)
+        """Set what a hierarchical name means.
 
-    def _part(self, name: str, element: ET.Element) -> Part:
+        What comes over a connection overrules what is set at its end, whatever sets it; else what
+        is set later overrules what was set before.
+        """
+        if owner in into.parts:
+            before = into.steps_to.get((owner, name), 0)
+            if len(passed) >= before:
+                into.parts[owner].starts[name] = value
+                into.steps_to[owner, name] = len(passed)
+            return
+        for joint in into.joints:
+            if joint.source == (owner, name) and joint.target not in passed:
+                there = value.through(joint.step, keep_unit=joint.keep_unit)
+                self._set(into, *joint.target, there, passed | {joint.target})
+        for element, inner in into.elements.get(owner, {}).items():
+            if name.startswith(f"{element}."):  # several may be meant: then all are
+                self._set(into, inner, name[len(element) + 1 :], value, passed)
+
+    def _part(self, name: str, element: ET.Element, rate: ET.Element | None) -> Part:
         kind = element.get("type", "application/x-fmu-sharedlibrary")
-        source = element.get("source") or ""
+        source = self._source(element)
         if kind != "application/x-fmu-sharedlibrary":
             raise ConfigurationError(
                 f"'{self._file}': component '{name}' is of type {kind}; terrafix reads FMUs "
@@ -326,13 +374,15 @@ class Gathering:
                 f"'{self._file}': component '{name}' wants its FMU run by {wanted}; terrafix runs "
                 "CoSimulation and ModelExchange"
             )
-        part = Part(name, self._resource(source), _KINDS[wanted])
+        file = proxied(source)
+        part = Part(name, self._resource(file or source), _KINDS[wanted], isolate=file is not None)
         part.starts = self._values(element)
         for connector in _children(element, "Connectors", "Connector"):
             unit = next((c.get("unit") for c in connector if c.get("unit")), None)
             if unit is not None:
                 part.units[str(connector.get("name"))] = self._unit(unit)
-        rate = next(element.iter(tag(OWN, "Rate")), None)
+        if rate is None:  # where it stood before
+            rate = next(element.iter(tag(OWN, "Rate")), None)
         if rate is not None:
             times = rate.get("times")
             part.rate = (
@@ -358,12 +408,14 @@ class Gathering:
             for unit in () if units is None else units.findall(tag(SSC, "Unit")):
                 base = unit.find(tag(SSC, "BaseUnit"))
                 if unit.get("name") == name and base is not None and base.attrib:
-                    powers = {symbol: int(base.get(symbol, "0")) for symbol in SI_BASE}
+                    where = f"'{self._file}': BaseUnit of '{name}'"
+                    powers = {s: integer(base.get(s, "0"), f"{where}: {s}") for s in SI_BASE}
                     factor, offset = (
-                        float(base.get(*a)) for a in (("factor", "1"), ("offset", "0"))
+                        float(exact(base.get(n) or default, f"{where}: {n}"))
+                        for n, default in (("factor", "1"), ("offset", "0"))
                     )
                     return unit_by_definition(name, factor, powers, offset)
-        return unit_by_name(name)
+        return unit_by_name(name.removeprefix("[").removesuffix("]"))
 
     def _values(self, element: ET.Element) -> dict[str, Value]:
         """Values that the bindings of an element give; the later overrule the earlier."""
@@ -405,19 +457,36 @@ class Gathering:
         root, missing = read_document(self._resource(source), self._file)
         self.note_undeclared(source, missing)
         if root.tag != name:
-            raise ConfigurationError(
-                f"{where}: '{source}' is no {name.rpartition('}')[2]} of SSP 1.0"
-            )
+            raise ConfigurationError(f"{where}: '{source}' is no {name.rpartition('}')[2]} of SSP")
         check_version(self._file, source, root)
         return root
 
+    def _source(self, element: ET.Element) -> str:
+        source = element.get("source")
+        if not source:
+            raise ConfigurationError(
+                f"'{self._file}': component '{element.get('name')}' has no source: it is a design "
+                "that nobody implemented\n  name its FMU as its source"
+            )
+        return source
+
     def _resource(self, source: str) -> Path:
-        path = (self._folder / source.removeprefix("file:")).resolve()
-        if not path.is_file():
-            path = (self._folder / unquote(source.removeprefix("file:"))).resolve()
-        if not path.is_relative_to(self._folder.resolve()) or not path.is_file():
-            raise ConfigurationError(f"'{self._file}' names '{source}', which is not in it")
-        return path
+        return self._package.resource(source, self._base)
+
+
+def described(file: Path, name: str, root: ET.Element) -> ET.Element:
+    """The system that a description is of.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is of none, or of a version of SSP that is not known.
+    """
+    top = root.find(tag(SSD, "System"))
+    if root.tag != tag(SSD, "SystemStructureDescription") or top is None:
+        raise ConfigurationError(f"'{file}': {name} describes no system of SSP")
+    check_version(file, name, root)
+    return top
 
 
 def check_version(file: Path, name: str, root: ET.Element) -> None:
@@ -428,6 +497,12 @@ def check_version(file: Path, name: str, root: ET.Element) -> None:
             f"'{file}': {name} is of version {version} of SSP; terrafix reads 1.x and 2.0\n"
             "  ask the tool that wrote it for one of these"
         )
+
+
+def _own(system: ET.Element, name: str) -> list[ET.Element]:
+    """What an annotation of terrafix says of a system."""
+    annotations = system.find(tag(SSD, "Annotations"))
+    return [] if annotations is None else list(annotations.iter(tag(OWN, name)))
 
 
 def _children(element: ET.Element, group: str, name: str) -> list[ET.Element]:

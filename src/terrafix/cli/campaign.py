@@ -79,9 +79,10 @@ def campaign(
     with ProgressBar(shown=not quiet and stderr_is_terminal(), first="preparing") as progress:
         from terrafix.cosim.campaign.batch import FileSource
         from terrafix.cosim.campaign.campaign import run_campaign
+        from terrafix.cosim.exchange.ssp.packages import is_package
 
-        ssp = Path(system).suffix.lower() == ".ssp"
-        source = read(system, settings) if ssp else FileSource(str(system), tuple(settings))
+        packed = is_package(Path(system))
+        source = read(system, settings) if packed else FileSource(str(system), tuple(settings))
         result = run_campaign(
             source,
             runs=runs,

@@ -57,22 +57,22 @@ def test_a_package_adds_a_format(tmp_path, install):
     (tmp_path / "coast.plain").write_text("coast\n")
     system = read_system(tmp_path / "coast.plain", [("a", "b")], outside=True)
     assert (system.name, system.doc) == ("coast", "[('a', 'b')] True")
-    assert ".plain, .ssp, .toml" in refusal(tmp_path / "coast.xyz")
+    assert ".plain, .ssd, .ssp, .toml" in refusal(tmp_path / "coast.xyz")
 
 
 def test_an_unknown_suffix_lists_those_that_are_read(tmp_path):
     assert refusal(tmp_path / "coast.yaml") == (
         f"cannot tell how to read system file '{tmp_path}/coast.yaml': no reader takes .yaml files"
-        "\n  suffixes of system files: .ssp, .toml"
+        "\n  suffixes of system files: .ssd, .ssp, .toml"
     )
     (tmp_path / "coast.toml").write_text(TOML)
-    assert refusal(tmp_path / "coast.tml").endswith(".ssp, .toml; did you mean 'coast.toml'?")
+    assert refusal(tmp_path / "coast.tml").endswith(".ssd, .ssp, .toml; did you mean 'coast.toml'?")
 
 
 def test_a_name_without_suffix_is_refused_and_the_file_that_was_meant_named(tmp_path):
     said = (
         f"cannot tell how to read system file '{tmp_path}/coast': its name has no suffix\n"
-        "  suffixes of system files: .ssp, .toml"
+        "  suffixes of system files: .ssd, .ssp, .toml"
     )
     assert refusal(tmp_path / "coast") == said
     (tmp_path / "coast.toml").write_text(TOML)

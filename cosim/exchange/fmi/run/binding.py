@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError, TerrafixError
+from terrafix.cosim.basics.scratch import shown
 from terrafix.cosim.exchange.fmi.run.archive import Archive
 from terrafix.cosim.exchange.fmi.run.clocks import Clocks
 from terrafix.cosim.exchange.fmi.run.whole import limits
@@ -230,7 +231,7 @@ class Library:
                 self._dll = ct.CDLL(str(path))
         except OSError as error:
             raise ConfigurationError(
-                f"the binary of '{archive.path}' cannot be loaded: {_why_not(path, error)}"
+                f"the binary of '{shown(archive.path)}' cannot be loaded: {_why_not(path, error)}"
             ) from error
         finally:
             os.chdir(here)
@@ -242,9 +243,9 @@ class Library:
             return getattr(self._dll, full)
         except AttributeError:
             raise ConfigurationError(
-                f"'{self.archive.path}' does not export {full}\n"
+                f"'{shown(self.archive.path)}' does not export {full}\n"
                 "  its binary is not one of FMI "
-                f"{self.version}: terrafix check-fmu {self.archive.path} says more"
+                f"{self.version}: terrafix check-fmu {shown(self.archive.path)} says more"
             ) from None
 
     def has(self, name: str) -> bool:

@@ -158,3 +158,16 @@ class Spring(SymbolicComponent):
             outputs={"x": x, "acceleration": a},
             step=ca.SX.sym("dt"),
         )
+
+
+class Doubling(SymbolicComponent):
+    """Each of three numbers, times two."""
+
+    default_rate = Rate("0.1")
+
+    u = Input((3,), unit="1", default=[0.0, 0.0, 0.0], doc="numbers")
+    y = Output((3,), unit="1", doc="times two")
+
+    def build_model(self):
+        u = ca.SX.sym("u", 3)
+        return Model("doubling", inputs={"u": u}, outputs={"y": 2 * u})

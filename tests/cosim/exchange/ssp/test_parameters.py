@@ -2,147 +2,17 @@
 
 from __future__ import annotations
 
-import re
-import zipfile
-
 import numpy as np
 import pytest
 from fmu_helpers import ECOS, in_another_process
-from plain_fmus import V, plain_fmu
+from ssp_parts import STEP, bindings, bound, connectors, link, packaged, part, system, values
 
 from terrafix.cli import main
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.exchange.fmi.run.binding import MODEL_EXCHANGE
-from terrafix.cosim.exchange.ssp.names import SSC, SSD, SSM, SSV
+from terrafix.cosim.exchange.ssp.names import SSC, SSM
 from terrafix.cosim.exchange.ssp.reading import read_ssp
 from terrafix.cosim.system.check import check
-
-
-@pytest.fixture(scope="module")
-def fmus(tmp_path_factory):
-    """k: y = k + u, length in m, and what it holds. p and q as in `test_starting`."""
-    folder = tmp_path_factory.mktemp("fmus")
-    kinds = [V("on", "parameter", True, "Boolean"), V("mode", "parameter", 1, "Enumeration")]
-    plain_fmu(
-        folder / "k.fmu",
-        [
-            V("u", "input", 0.0),
-            V("k", "parameter", 1.0),
-            V("length", "parameter", 1.0, unit="m"),
-            *kinds,
-            V("word", "parameter", "no", "String"),
-            V("echo", "output", kind="String"),
-            V("y", "output", depends="u"),
-            V("said", "output", kind="Integer"),
-            V("far", "output", unit="m"),
-            V("kept", "output", 4.0, initial="exact"),
-            V("time", "output"),
-        ],
-        begin="time = t;",
-        outputs="y = k + u; said = 10 * mode + on + 100 * (int)strlen(word); far = length;",
-        step="time = t + h;",
-    )
-    plain_fmu(folder / "p.fmu", [V("x", "output", 1.0, depends="")], step="x = 1.0 + t + h;")
-    plain_fmu(
-        folder / "q.fmu",
-        [V("u", "input", 0.0), V("y", "output", depends="u"), V("s", "local")],
-        begin="s = u;",
-        outputs="y = s;",
-        step="s += h * u;",
-    )
-    return {n: (folder / f"{n}.fmu").read_bytes() for n in "kpq"}
-
-
-def part(name, source="k", inside="", more=""):
-    return f'<ssd:Component name="{name}" source="{source}.fmu" {more}>{inside}</ssd:Component>'
-
-
-def bound(prefix="", mapping="", **values):
-    written = ""
-    for name, value in values.items():
-        kind, text = value if isinstance(value, tuple) else ("Real", value)
-        name = name.replace("__", ".")
-        written += f'<ssv:Parameter name="{name}"><ssv:{kind} value="{text}"/></ssv:Parameter>'
-    written = written.replace(' m"', '" unit="m"').replace(' cm"', '" unit="cm"')
-    return (
-        f'<ssd:ParameterBinding prefix="{prefix}"><ssd:ParameterValues><ssv:ParameterSet '
-        f'version="1.0" name="v"><ssv:Parameters>{written}</ssv:Parameters></ssv:ParameterSet>'
-        f"</ssd:ParameterValues>{mapping}</ssd:ParameterBinding>"
-    )
-
-
-def bindings(*each):
-    return f"<ssd:ParameterBindings>{''.join(each)}</ssd:ParameterBindings>"
-
-
-def connectors(**kinds):
-    made = "".join(
-        f'<ssd:Connector name="{n}" kind="{k}"><ssc:Real/></ssd:Connector>'
-        for n, k in kinds.items()
-    )
-    return f"<ssd:Connectors>{made}</ssd:Connectors>"
-
-
-def link(start, end, inside=""):
-    text = ""
-    for side, name in (("start", start), ("end", end)):
-        owner, _, connector = name.rpartition(".")
-        text += f' {side}Element="{owner}"' if owner else ""
-        text += f' {side}Connector="{connector}"'
-    return f"<ssd:Connection{text}>{inside}</ssd:Connection>"
-
-
-def system(elements, *links, name="top", before=""):
-    joined = f"<ssd:Connections>{''.join(links)}</ssd:Connections>" if links else ""
-    return (
-        f'<ssd:System name="{name}">{before}<ssd:Elements>{elements}</ssd:Elements>'
-        f"{joined}</ssd:System>"
-    )
-
-
-STEP = (
-    '<ssd:Annotations><ssc:Annotation type="com.opensimulationplatform"><osp:Algorithm '
-    'xmlns:osp="http://opensimulationplatform.com/SSP/OSPAnnotations">'
-    '<osp:FixedStepAlgorithm baseStepSize="0.1"/></osp:Algorithm></ssc:Annotation>'
-    "</ssd:Annotations>"
-)
-
-
-def packaged(
-    path,
-    fmus,
-    top,
-    *,
-    version="1.0",
-    experiment='startTime="0" stopTime="1"',
-    step=STEP,
-    declared=True,
-    **files,
-):
-    text = (
-        f'<ssd:SystemStructureDescription xmlns:ssd="{SSD}" xmlns:ssc="{SSC}" xmlns:ssv="{SSV}" '
-        f'xmlns:ssm="{SSM}" version="{version}" name="theirs">{top}'
-        f"<ssd:DefaultExperiment {experiment}>{step}</ssd:DefaultExperiment>"
-        "</ssd:SystemStructureDescription>"
-    )
-    if not declared:
-        for prefix in ("ssc", "ssv", "osp"):
-            text = re.sub(f' xmlns:{prefix}="[^"]*"', "", text)
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("SystemStructure.ssd", text)
-        for name, data in ({f"{n}.fmu": d for n, d in fmus.items()} | files).items():
-            archive.writestr(name.replace("_ssm", ".ssm"), data)
-    return path
-
-
-def values(file, *paths, t="0"):
-    simulation = Simulation(read_ssp(file), members=1)
-    simulation.run_until(t)
-    found = [simulation.master.wiring.slots[p].data[0, 0].item() for p in paths]
-    simulation.master.terminate()
-    return found
-
 
 # ------------------------------------------------------------------ what is set
 
@@ -208,8 +78,44 @@ def test_text_that_is_connected_is_named(tmp_path, fmus):
         read_ssp(file)
 
 
+def test_a_connection_overrules_what_is_set_at_its_end(tmp_path, fmus):
+    """a.k is connected to gain, 30, and B.a.k to inside and that to gain, also where k is set."""
+    own = bindings(bound(k="2"))
+    inner = system(
+        part("a", inside=own),
+        link("inside", "a.k"),
+        name="B",
+        before=connectors(inside="parameter"),
+    )
+    given = bindings(bound(gain="30", a__k="10", B__a__k="11", B__inside="12"), bound(a__k="13"))
+    top = system(
+        part("a", inside=own) + inner,
+        link("gain", "a.k"),
+        link("gain", "B.inside"),
+        before=connectors(gain="parameter") + given,
+    )
+    assert values(packaged(tmp_path / "x.ssp", fmus, top), "a.y", "B_a.y") == [30.0, 30.0]
+
+
+def test_one_side_without_a_unit_takes_the_number_as_it_is(tmp_path, fmus):
+    """3 m go to u, which has no unit: y = k + u = 4, and a note says so."""
+    top = system(part("a", inside=bindings(bound(length="3 m"))) + part("b"), link("a.far", "b.u"))
+    file = packaged(tmp_path / "x.ssp", fmus, top)
+    assert values(file, "b.y") == [4.0]
+    assert "'b.u' has no unit: taken as m, that of what it reads" in check(read_ssp(file)).notes
+
+
+def test_units_in_brackets_as_simulink_writes_them(tmp_path, fmus):
+    given = bound(length="2 m").replace('unit="m"', 'unit="[m]"')
+    file = packaged(tmp_path / "x.ssp", fmus, system(part("a", inside=bindings(given))))
+    assert values(file, "a.far") == [2.0]
+
+
 def test_mappings_inline_and_in_a_file(tmp_path, fmus):
-    """length = 2 * 3 m + 0.5; mode by a table from 7 to 2; what is not mapped keeps its name."""
+    """length = 2 * 3 m + 0.5; mode by a table from 7 to 2; k, not mapped, is not applied.
+
+    "Non-mapped parameter values are not applied in this case." (SSP 2.0, 5.2.4)
+    """
     entries = (
         '<ssm:MappingEntry source="L" target="length"><ssc:LinearTransformation factor="2" '
         'offset="0.5"/></ssm:MappingEntry><ssm:MappingEntry source="number" target="mode">'
@@ -228,7 +134,29 @@ def test_mappings_inline_and_in_a_file(tmp_path, fmus):
     ):
         top = system(part("a", inside=bindings(bound(mapping=how, **given))))
         file = packaged(tmp_path / "x.ssp", fmus, top, **files)
-        assert values(file, "a.far", "a.said", "a.y") == [6.5, 20 + 1 + 200, 6.0]
+        assert values(file, "a.far", "a.said", "a.y") == [6.5, 20 + 1 + 200, 1.0]
+
+
+def test_a_table_leaves_what_it_does_not_list(tmp_path, fmus):
+    """8 is not listed, and 3 is fast: "values not mapped ... are kept unchanged" (SSP 2.0)."""
+    table = "<ssc:MapEntry source='7' target='2'/>"
+    for given, mode in (("7", 2), ("3", 3)):
+        mapping = (
+            '<ssd:ParameterMapping><ssm:ParameterMapping version="1.0"><ssm:MappingEntry '
+            'source="n" target="mode"><ssc:IntegerMappingTransformation>'
+            f"{table}</ssc:IntegerMappingTransformation></ssm:MappingEntry>"
+            "</ssm:ParameterMapping></ssd:ParameterMapping>"
+        )
+        top = system(part("a", inside=bindings(bound(mapping=mapping, n=("Integer", given)))))
+        file = packaged(tmp_path / "x.ssp", fmus, top)
+        assert values(file, "a.said") == [10 * mode + 1 + 200]
+
+
+def test_one_name_of_two_things_sets_both(tmp_path, fmus):
+    """B.C in the top, and C in B, whose k are both B.C.k (SSP 2.0, 5.2.4, "punning")."""
+    inner = system(part("C"), name="B")
+    top = system(part("B.C") + inner, before=bindings(bound(B__C__k="3")))
+    assert values(packaged(tmp_path / "x.ssp", fmus, top), "B_C.y", "B_C_2.y") == [3.0, 3.0]
 
 
 # ------------------------------------------------------------------ names, kinds, times, versions
