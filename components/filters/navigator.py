@@ -96,7 +96,7 @@ class RadarInertialPredict(InertialPredict):
     """The same with the biases of a radar, and position and velocity at an aperture's center."""
 
     error_state, process = NAVIGATOR, navigator_process(NAVIGATOR, "wgs84")
-    sigmas = _SIGMAS
+    sigmas = {n: s for n, s in _SIGMAS.items() if n in NAVIGATOR.places}  # noqa: RUF012
 
     range_bias_sigma = _sigma(0.3)
     range_bias_time = _time(100.0)
