@@ -172,3 +172,34 @@ def _column(m: int, degree: int, zeta: Any, squared: Any, ratio: FloatArray) -> 
         else:
             column[n] = zeta * column[n - 1] - ratio[n, m] * (squared * column[n - 2])
     return column
+
+
+def solid_harmonics(r: Any, radius: Any, degree: int) -> tuple[dict[Any, Any], dict[Any, Any]]:
+    r"""Fully normalized functions of a place, by degree and order.
+
+    .. math::
+        \left( \frac{a}{r} \right)^{n+1} \bar P_{nm}(\sin \varphi) \cos m \lambda, \qquad
+        \left( \frac{a}{r} \right)^{n+1} \bar P_{nm}(\sin \varphi) \sin m \lambda.
+
+    Parameters
+    ----------
+    r : SX, shape (3,)
+        Position [m].
+    radius : SX or float
+        [m]
+    degree : int
+        The largest.
+    """
+    inverse = 1 / ca.dot(r, r)
+    s = radius * inverse * r
+    squared = radius * radius * inverse
+    q = ca.sqrt(squared)
+    scale, ratio = _scales(degree)
+    power = (ca.SX(1), ca.SX(0))
+    cosines, sines = {}, {}
+    for m in range(degree + 1):
+        for n, value in _column(m, degree, s[2], squared, ratio).items():
+            cosines[n, m] = q * scale[n, m] * value * power[0]
+            sines[n, m] = q * scale[n, m] * value * power[1]
+        power = (s[0] * power[0] - s[1] * power[1], s[0] * power[1] + s[1] * power[0])
+    return cosines, sines
