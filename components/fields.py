@@ -24,6 +24,30 @@ KNOWN_STATE = {
 }
 """A position and velocity known with a covariance."""
 
+START = {
+    "r_e": Field((3,), "m", "e", labels=XYZ, doc="position"),
+    "v_e": Field((3,), "m/s", "e", labels=XYZ, doc="velocity relative to the Earth"),
+}
+"""Where a satellite starts."""
+
+ENVIRONMENT = {
+    "time": Field((), "s", doc="that the rest holds for"),
+    "omega_e": Field((3,), "rad/s", "e", labels=XYZ, doc="rotation of the Earth-fixed axes"),
+    "q_ei": Field((4,), "1", "e", doc="inertial (GCRF) to Earth-fixed (ITRF)"),
+    "sun_e": Field((3,), "m", "e", labels=XYZ, doc="Sun, from the Earth's center"),
+    "sun_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
+    "moon_e": Field((3,), "m", "e", labels=XYZ, doc="Moon, from the Earth's center"),
+    "moon_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
+}
+"""What surrounds a satellite, at the time of publication; turned inside models until the next."""
+
+AIR = {
+    "r_e": Field((3,), "m", "e", labels=XYZ, doc="where it holds"),
+    "log_density": Field((), "1", doc="natural logarithm of the density in kg/m^3"),
+    "gradient": Field((3,), "1/m", "e", labels=XYZ, doc="of that logarithm"),
+}
+"""Density of the air about a place."""
+
 ESTIMATE = {
     "r_e": Field((3,), "m", "e", labels=XYZ, doc="position"),
     "v_e": Field((3,), "m/s", "e", labels=XYZ, doc="velocity relative to the Earth"),

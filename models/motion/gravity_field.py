@@ -111,6 +111,26 @@ def shipped_field() -> GravityField:
     return read_gfc(SHIPPED)
 
 
+def chosen_field(path: Path | None, degree: int) -> GravityField:
+    """The field of a file, or the one that is shipped, to a degree.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read or is refused, or does not reach the degree.
+    """
+    try:
+        field = shipped_field() if path is None else read_gfc(path)
+    except OSError as error:
+        raise ValueError(f"cannot read the gravity field: {error}") from error
+    if path is None and degree > field.max_degree:
+        raise ValueError(
+            f"degree {degree} is more than the {field.max_degree} of EGM2008 that is shipped\n"
+            "  set gravity_file to a file (.gfc) of https://icgem.gfz.de that has it"
+        )
+    return field.cut(degree)
+
+
 def read_gfc(path: str | Path) -> GravityField:
     """Read a static gravity field in the format of ICGEM [1]_.
 
