@@ -109,6 +109,15 @@ INPUTS = {
     "dof": (4.0, 0.0),
     "accepted": (1.0, 0.0),
     "reason": (0.0, 0.0),
+    "time": (0.0, 0.0),
+    "omega_e": (np.array([1e-10, -1e-10, 7.292115e-5]), 1e-12),
+    "q_ei": (np.array([0.0, 0.0, 0.0, 1.0]), 0.0),
+    "sun_e": (np.array([1.2e11, 8e10, 3e10]), 1e6),
+    "sun_rate_e": (np.array([2e4, 2e4, 1e4]), 1.0),
+    "moon_e": (np.array([-3e8, 2e8, 1e8]), 1e4),
+    "moon_rate_e": (np.array([500.0, 800.0, 300.0]), 1.0),
+    "log_density": (-31.0, 0.1),
+    "gradient": (-R_E / np.linalg.norm(R_E) / 7e4, 1e-7),
 }
 INERTIAL = {
     "velocity_random_walk": 1e-3,
@@ -137,6 +146,14 @@ SETTINGS = {
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "mekf_predict_smoothed": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "orbit": {"r0_i": R_E, "v0_i": [-560.1, 3729.6, 6497.9]},
+    "satellite": {
+        "degree": 3,
+        **dict.fromkeys(("surrounded", "sun", "moon", "tide", "radiation"), True),
+        "drag": "atmosphere",
+        "ballistic_coefficient": 0.02,
+        "radiation_coefficient": 0.02,
+        "maneuvers": {"up": {"start": 0.3, "duration": 0.4, "delta_v": [1.0, 0.0, 0.0]}},
+    },
     "synthetic_sar_fix": {"look": 0.6},
 }
 RATES = dict.fromkeys(("last_known_state", "last_known_flight"), Rate(times=["0"]))
