@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.components.fields import ESTIMATE, FIX, INNOVATION, KNOWN_STATE
+from terrafix.components.fields import ENVIRONMENT, ESTIMATE, FIX, INNOVATION, KNOWN_STATE
 from terrafix.components.filters.family import check_start, transition_ports
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.declare.parameters import Choice, Parameter
+from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
     BundleOutput,
@@ -33,7 +34,12 @@ from terrafix.models.filters.spacecraft import (
 from terrafix.models.filters.updates import UPDATES
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.motion.gravity import GRAVITY_MODELS
+from terrafix.models.motion.gravity_field import chosen_field
+from terrafix.models.motion.satellite import Forces
 from terrafix.models.sensors.sar import IN_TRACK
+
+_BODIES = ("sun", "moon", "tide")
+"""What needs the surroundings."""
 
 
 class MekfPredict(SymbolicComponent):
@@ -41,7 +47,14 @@ class MekfPredict(SymbolicComponent):
 
     default_rate = Rate(hz=100)
 
-    gravity = Choice(GRAVITY_MODELS, "j2", doc="gravity field of the filter")
+    gravity = Choice(
+        (*GRAVITY_MODELS, "harmonics"), "j2", doc="gravity field of the filter: harmonics of a file"
+    )
+    degree = Count(20, minimum=2, doc="and order of the harmonics")
+    gravity_file = OptionalFilePath(doc="field (.gfc) in place of EGM2008 to degree 70")
+    sun = Flag(False, doc="pull of the Sun, with harmonics and surroundings")
+    moon = Flag(False, doc="pull of the Moon, with harmonics and surroundings")
+    tide = Flag(False, doc="tide of the solid Earth, with harmonics and surroundings")
     transition = Choice(
         TRANSITIONS, "exact", doc="printed: the paper's, without Coriolis (negative control)"
     )
@@ -49,6 +62,7 @@ class MekfPredict(SymbolicComponent):
     radius = Parameter(EARTH.radius, unit="m", positive=True, doc="equatorial radius")
     j2 = Parameter(EARTH.j2, doc="second zonal coefficient")
     rotation_rate = Parameter(EARTH.rotation_rate, unit="rad/s", doc="Earth rotation")
+    pole = Parameter(0.0, shape=(2,), unit="rad", doc="polar motion x, y (harmonics)")
     accel_psd = Parameter(0.0, unit="m^2/s^3", minimum=0.0, doc="process noise of velocity")
     misalignment_psd = Parameter(
         0.0, unit="rad^2/s", minimum=0.0, doc="process noise of the misalignment"
@@ -59,7 +73,29 @@ class MekfPredict(SymbolicComponent):
     posterior = MessageInput(fields=ESTIMATE, at="start", doc="corrected estimate")
     delta_v_b = Input((3,), unit="m/s", frame="b", doc="measured velocity increment")
     q_be = Input((4,), unit="1", frame="b", doc="measured attitude, Earth-fixed to body")
+    surroundings = BundleInput(ENVIRONMENT, doc="rotation of the Earth, Sun and Moon")
     prior = BundleOutput(ESTIMATE, doc="estimate before any fix of this instant")
+
+    def prepare(self) -> None:
+        """Keep the inputs that are read, as the choices are."""
+        if not any(self.setting(name) for name in _BODIES):
+            self.ports = {n: p for n, p in self.ports.items() if n != "surroundings"}
+
+    def takes(self, name: str) -> bool:
+        """Whether a parameter has any effect, as the choices are now."""
+        if name in ("degree", "gravity_file", *_BODIES):
+            return bool(self.setting("gravity") == "harmonics")
+        return super().takes(name)
+
+    def validate(self) -> None:
+        """Look whether Sun, Moon and tide go with harmonics."""
+        chosen = [name for name in _BODIES if self.setting(name)]
+        if chosen and self.setting("gravity") != "harmonics":
+            raise ConfigurationError(
+                f"'{self.name}.{chosen[0]}' goes with gravity = \"harmonics\"; it is "
+                f'"{self.setting("gravity")}"'
+            )
+        super().validate()
 
     def _initialize_impl(self) -> None:
         super()._initialize_impl()
@@ -67,7 +103,13 @@ class MekfPredict(SymbolicComponent):
 
     def build_model(self) -> Model:
         """Build the model for the chosen gravity and transition."""
-        return mekf_predict_model(self.gravity, self.transition)
+        return mekf_predict_model(self._field(), self.transition)
+
+    def _field(self) -> str | Forces:
+        if self.gravity != "harmonics":
+            return str(self.gravity)
+        field = chosen_field(self.gravity_file, self.degree)
+        return Forces(field, sun=self.sun, moon=self.moon, tide=self.tide)
 
 
 class SmoothedMekfPredict(MekfPredict):
@@ -77,7 +119,7 @@ class SmoothedMekfPredict(MekfPredict):
 
     def build_model(self) -> Model:
         """Build the model for the chosen gravity and transition."""
-        return mekf_predict_model(self.gravity, self.transition, smoothed=True)
+        return mekf_predict_model(self._field(), self.transition, smoothed=True)
 
 
 class MekfCorrect(SymbolicComponent):
