@@ -24,23 +24,6 @@ KNOWN_STATE = {
 }
 """A position and velocity known with a covariance."""
 
-START = {
-    "r_e": Field((3,), "m", "e", labels=XYZ, doc="position"),
-    "v_e": Field((3,), "m/s", "e", labels=XYZ, doc="velocity relative to the Earth"),
-}
-"""Where a satellite starts."""
-
-ENVIRONMENT = {
-    "time": Field((), "s", doc="that the rest holds for"),
-    "omega_e": Field((3,), "rad/s", "e", labels=XYZ, doc="rotation of the Earth-fixed axes"),
-    "q_ei": Field((4,), "1", "e", doc="inertial (GCRF) to Earth-fixed (ITRF)"),
-    "sun_e": Field((3,), "m", "e", labels=XYZ, doc="Sun, from the Earth's center"),
-    "sun_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
-    "moon_e": Field((3,), "m", "e", labels=XYZ, doc="Moon, from the Earth's center"),
-    "moon_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
-}
-"""What surrounds a satellite, at the time of publication; turned inside models until the next."""
-
 AIR = {
     "r_e": Field((3,), "m", "e", labels=XYZ, doc="where it holds"),
     "log_density": Field((), "1", doc="natural logarithm of the density in kg/m^3"),
@@ -350,3 +333,20 @@ SPOTLIGHT_FIX = {
     "accepted": Field((), "1", doc="1 where the image was recognized, else 0"),
 }
 """What a spotlight image says about its track."""
+
+START = {
+    "r_e": Field((3,), "m", "e", labels=XYZ, doc="position"),
+    "v_e": Field((3,), "m/s", "e", labels=XYZ, doc="velocity relative to the Earth"),
+}
+"""Where a satellite is at t = 0."""
+
+ENVIRONMENT = {
+    "time": Field((), "s", doc="that the rest holds for"),
+    "omega_e": Field((3,), "rad/s", "e", labels=XYZ, doc="rotation of the Earth-fixed axes"),
+    "q_ei": Field((4,), "1", "e", doc="inertial (GCRF) to Earth-fixed (ITRF)"),
+    "sun_e": Field((3,), "m", "e", labels=XYZ, doc="Sun, from the Earth's center"),
+    "sun_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
+    "moon_e": Field((3,), "m", "e", labels=XYZ, doc="Moon, from the Earth's center"),
+    "moon_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
+}
+"""What surrounds a satellite, at the time of publication; turned inside models until the next."""
