@@ -254,13 +254,13 @@ def speed() -> None:
     for degree in (20, 36):
         with tempfile.TemporaryDirectory() as cache:
             os.environ["TERRAFIX_CACHE"] = cache
-            seconds = [_seconds(lambda: _compiled(degree)) for _ in range(2)]
+            seconds = [_seconds(partial(_compiled, degree)) for _ in range(2)]
             del os.environ["TERRAFIX_CACHE"]
         print(f"{degree} x {degree}: ready after {seconds[0]:.1f} s, then {seconds[1]:.1f} s")
     times = {}
     for name in ("orbit, J2", "satellite, 20 x 20"):
         _open_loop(name, "10")
-        times[name] = min(_seconds(lambda: _open_loop(name, "590.4")) for _ in range(3))
+        times[name] = min(_seconds(partial(_open_loop, name, "590.4")) for _ in range(3))
         print(f"TC-1, 100 members, {name}: {times[name]:.2f} s")
     print(f"ratio {times['satellite, 20 x 20'] / times['orbit, J2']:.2f} (bar: 3)")
 
