@@ -180,7 +180,7 @@ def beside_brahe() -> None:
         )
         apart = []
         for until, expected in zip((600.0, 86400.0), theirs, strict=True):
-            step = 1.0 if degree == 20 or until == 600.0 else 2.0
+            step = 1.0 if until == 600.0 else 2.0
             ours = reference.flown(
                 forces,
                 r_i,

@@ -21,6 +21,7 @@ from terrafix.cosim.declare.ports import (
     Input,
     MessageInput,
     MessageOutput,
+    Port,
 )
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
@@ -78,8 +79,12 @@ class MekfPredict(SymbolicComponent):
 
     def prepare(self) -> None:
         """Keep the inputs that are read, as the choices are."""
-        if not any(self.setting(name) for name in _BODIES):
-            self.ports = {n: p for n, p in self.ports.items() if n != "surroundings"}
+        read = any(self.setting(name) for name in _BODIES)
+        self.ports = {
+            name: port
+            for name, port in self.declarations.items()
+            if isinstance(port, Port) and (read or name != "surroundings")
+        }
 
     def takes(self, name: str) -> bool:
         """Whether a parameter has any effect, as the choices are now."""

@@ -17,7 +17,7 @@ from terrafix.cosim.declare.parameters import (
     Parameter,
     Table,
 )
-from terrafix.cosim.declare.ports import BundleInput, MessageInput
+from terrafix.cosim.declare.ports import BundleInput, MessageInput, Port
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
 from terrafix.models.geometry.earth import EARTH
@@ -103,7 +103,11 @@ class SatelliteOrbit(SymbolicComponent):
             "surroundings": self.setting("surrounded"),
             "atmosphere": self.setting("drag") == "atmosphere",
         }
-        self.ports = {n: p for n, p in self.ports.items() if read.get(n, True)}
+        self.ports = {
+            name: port
+            for name, port in self.declarations.items()
+            if isinstance(port, Port) and read.get(name, True)
+        }
 
     def takes(self, name: str) -> bool:
         """Whether a parameter has any effect, as the choices are now."""

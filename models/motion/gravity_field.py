@@ -122,7 +122,10 @@ def chosen_field(path: Path | None, degree: int) -> GravityField:
     try:
         field = shipped_field() if path is None else read_gfc(path)
     except OSError as error:
-        raise ValueError(f"cannot read the gravity field: {error}") from error
+        raise ValueError(
+            f"cannot read the gravity field '{path}': {(error.strerror or str(error)).lower()}\n"
+            "  set gravity_file to a file (.gfc), or leave it out: EGM2008 to degree 70 is there"
+        ) from error
     if path is None and degree > field.max_degree:
         raise ValueError(
             f"degree {degree} is more than the {field.max_degree} of EGM2008 that is shipped\n"
