@@ -135,21 +135,82 @@ def real() -> None:
     at = surroundings(orbit.utc[0])
     forces = Forces(shipped_field(), sun=True, moon=True, tide=True, radiation=True)
     print(f"Sentinel-1A from {orbit.utc[0]} UTC, {shipped_field()}, Sun, Moon, tide, radiation")
-    print(f"{'start [s]':>10} {'10 min [m]':>11} {'100 min [m]':>12}")
+    print("distance to the file's later states [m]; brahe's with the same forces, and with step 2")
+    print("of the tide, the pole tide, relativity and drag (Harris-Priester, 6 m^2) besides")
+    columns = ("start [s]", "10 min", "100 min", "brahe 10 min", "100 min", "more 100 min")
+    print(" ".join(f"{name:>12}" for name in columns))
     for start in STARTS:
         k, marks = start // 10, (600.0, 6000.0)
+        state = orbit.r_e[k], orbit.v_e[k]
         flown = fly(
-            forces,
-            orbit.r_e[k],
-            orbit.v_e[k],
-            at,
-            float(orbit.t[k]),
-            marks,
-            5.0,
-            radiation_coefficient=SENTINEL,
+            forces, *state, at, float(orbit.t[k]), marks, 5.0, radiation_coefficient=SENTINEL
         )
-        apart = [np.linalg.norm(flown[m][0] - orbit.r_e[k + int(m) // 10]) for m in marks]
-        print(f"{start:10d} {apart[0]:11.4f} {apart[1]:12.3f}", flush=True)
+        wanted = [orbit.r_e[k + int(mark) // 10] for mark in marks]
+        apart = [np.linalg.norm(flown[m][0] - r) for m, r in zip(marks, wanted, strict=True)]
+        for more in (False, True):
+            theirs = _by_brahe(np.concatenate(state), orbit.utc[k], marks, more)
+            apart += [np.linalg.norm(x - r) for x, r in zip(theirs, wanted, strict=True)]
+        shown = [apart[i] for i in (0, 1, 2, 3, 5)]
+        print(f"{start:12d} " + " ".join(f"{x:12.3f}" for x in shown), flush=True)
+
+
+def _by_brahe(state: Any, utc: np.datetime64, marks: tuple[float, ...], more: bool) -> list[Any]:
+    """Positions at marks [s] by brahe, Earth-fixed, from such a state."""
+    import brahe
+
+    _tables_of_brahe(brahe)
+    value = brahe.ParameterSource.value
+    low = brahe.EphemerisSource.LowPrecision
+    forces = brahe.ForceModelConfig(
+        gravity=brahe.GravityConfiguration(
+            degree=70, order=70, model_type=brahe.GravityModelType.from_file(str(SHIPPED))
+        ),
+        third_body=[
+            brahe.ThirdBodyConfiguration(body, low)
+            for body in (brahe.ThirdBody.SUN, brahe.ThirdBody.MOON)
+        ],
+        srp=brahe.SolarRadiationPressureConfiguration(
+            area=value(25.0), cr=value(1.3), eclipse_model=brahe.EclipseModel.CONICAL
+        ),
+        drag=brahe.DragConfiguration(
+            model=brahe.AtmosphericModel.HARRIS_PRIESTER, area=value(6.0), cd=value(2.2)
+        )
+        if more
+        else None,
+        mass=value(2157.0),
+        relativity=more,
+    )
+    forces.tides = brahe.TidesConfiguration(
+        permanent=brahe.PermanentTideConfig.AUTO,
+        solid=brahe.SolidTideConfig(frequency_dependent=more, pole_tide=more),
+    )
+    midnight = brahe.Epoch.from_datetime(2022, 9, 18, 0, 0, 0.0, 0.0, brahe.TimeSystem.UTC)
+    since = (utc - np.datetime64("2022-09-18T00:00:00", "ns")) / np.timedelta64(1, "s")
+    start = midnight + float(since)
+    propagator = brahe.NumericalOrbitPropagator(
+        start,
+        brahe.state_itrf_to_gcrf(start, state),
+        brahe.NumericalPropagationConfig.high_precision(),
+        forces,
+        np.array([2157.0]),
+    )
+    found = []
+    for mark in marks:
+        propagator.propagate_to(start + mark)
+        inertial = np.asarray(propagator.current_state())[:6]
+        found.append(brahe.state_gcrf_to_itrf(start + mark, inertial)[:3])
+    return found
+
+
+def _tables_of_brahe(brahe: Any) -> None:
+    """The day's Earth orientation; brahe 1.8.0 takes three of them under each other's names."""
+    x, y = 0.293584 * ARC_SECOND, 0.287785 * ARC_SECOND
+    dx, dy = 4.06e-4 * ARC_SECOND, -1.24e-4 * ARC_SECOND
+    provider = brahe.StaticEOPProvider.from_values(
+        pm_x=y, pm_y=-0.0092607, ut1_utc=x, dx=dx, dy=dy, lod=0.0
+    )
+    brahe.set_global_eop_provider_from_static_provider(provider)
+    assert brahe.get_global_pm(59840.0) == (x, y)
 
 
 def beside_brahe() -> None:
