@@ -13,7 +13,6 @@ import numpy as np
 from terrafix.components.fields import ENVIRONMENT, ESTIMATE, FIX, INNOVATION, KNOWN_STATE
 from terrafix.components.filters.family import check_start, transition_ports
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -21,7 +20,6 @@ from terrafix.cosim.declare.ports import (
     Input,
     MessageInput,
     MessageOutput,
-    Port,
 )
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.models.core.model import Model
@@ -39,9 +37,6 @@ from terrafix.models.motion.gravity_field import chosen_field
 from terrafix.models.motion.satellite import Forces
 from terrafix.models.sensors.sar import IN_TRACK
 
-_BODIES = ("sun", "moon", "tide")
-"""What needs the surroundings."""
-
 
 class MekfPredict(SymbolicComponent):
     """Dead reckoning between fixes, and the covariance of its error."""
@@ -53,9 +48,6 @@ class MekfPredict(SymbolicComponent):
     )
     degree = Count(20, minimum=2, doc="and order of the harmonics")
     gravity_file = OptionalFilePath(doc="field (.gfc) in place of EGM2008 to degree 70")
-    sun = Flag(False, doc="pull of the Sun, with harmonics and surroundings")
-    moon = Flag(False, doc="pull of the Moon, with harmonics and surroundings")
-    tide = Flag(False, doc="tide of the solid Earth, with harmonics and surroundings")
     transition = Choice(
         TRANSITIONS, "exact", doc="printed: the paper's, without Coriolis (negative control)"
     )
@@ -74,33 +66,13 @@ class MekfPredict(SymbolicComponent):
     posterior = MessageInput(fields=ESTIMATE, at="start", doc="corrected estimate")
     delta_v_b = Input((3,), unit="m/s", frame="b", doc="measured velocity increment")
     q_be = Input((4,), unit="1", frame="b", doc="measured attitude, Earth-fixed to body")
-    surroundings = BundleInput(ENVIRONMENT, doc="rotation of the Earth, Sun and Moon")
     prior = BundleOutput(ESTIMATE, doc="estimate before any fix of this instant")
-
-    def prepare(self) -> None:
-        """Keep the inputs that are read, as the choices are."""
-        read = any(self.setting(name) for name in _BODIES)
-        self.ports = {
-            name: port
-            for name, port in self.declarations.items()
-            if isinstance(port, Port) and (read or name != "surroundings")
-        }
 
     def takes(self, name: str) -> bool:
         """Whether a parameter has any effect, as the choices are now."""
-        if name in ("degree", "gravity_file", *_BODIES):
+        if name in ("degree", "gravity_file"):
             return bool(self.setting("gravity") == "harmonics")
         return super().takes(name)
-
-    def validate(self) -> None:
-        """Look whether Sun, Moon and tide go with harmonics."""
-        chosen = [name for name in _BODIES if self.setting(name)]
-        if chosen and self.setting("gravity") != "harmonics":
-            raise ConfigurationError(
-                f"'{self.name}.{chosen[0]}' goes with gravity = \"harmonics\"; it is "
-                f'"{self.setting("gravity")}"'
-            )
-        super().validate()
 
     def _initialize_impl(self) -> None:
         super()._initialize_impl()
@@ -113,8 +85,7 @@ class MekfPredict(SymbolicComponent):
     def _field(self) -> str | Forces:
         if self.gravity != "harmonics":
             return str(self.gravity)
-        field = chosen_field(self.gravity_file, self.degree)
-        return Forces(field, sun=self.sun, moon=self.moon, tide=self.tide)
+        return Forces(chosen_field(self.gravity_file, self.degree))
 
 
 class SmoothedMekfPredict(MekfPredict):
@@ -125,6 +96,19 @@ class SmoothedMekfPredict(MekfPredict):
     def build_model(self) -> Model:
         """Build the model for the chosen gravity and transition."""
         return mekf_predict_model(self._field(), self.transition, smoothed=True)
+
+
+class SurroundedMekfPredict(MekfPredict):
+    """Dead reckoning with harmonics, Sun, Moon and tide, about the axis that surroundings tell."""
+
+    gravity = Choice(("harmonics",), "harmonics", doc="gravity field of the filter")
+    tide = Flag(True, doc="tide of the solid Earth besides Sun and Moon")
+
+    surroundings = BundleInput(ENVIRONMENT, doc="rotation of the Earth, Sun and Moon")
+
+    def _field(self) -> Forces:
+        field = chosen_field(self.gravity_file, self.degree)
+        return Forces(field, sun=True, moon=True, tide=self.tide)
 
 
 class MekfCorrect(SymbolicComponent):

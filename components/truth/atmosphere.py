@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from terrafix.components.fields import AIR, XYZ
@@ -41,10 +43,11 @@ class Atmosphere(Component):
     def _start(self) -> np.datetime64:
         text = str(self.setting("epoch"))
         words = text.split()
+        start: np.datetime64[Any]
         try:
             start = np.datetime64(words[0].removesuffix("Z"), "ns")
         except (ValueError, IndexError):
-            start = np.datetime64("NaT")
+            start = np.datetime64("NaT", "ns")
         if np.isnat(start) or words[1:] not in ([], ["UTC"]):
             raise ConfigurationError(
                 f"'{self.name}.epoch' is '{text}', which is no date in UTC\n"

@@ -145,6 +145,7 @@ SETTINGS = {
     "inertial_predict_radar": INERTIAL,
     "mekf_correct": {"look": 0.6},
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
+    "mekf_predict_surrounded": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6, "degree": 3},
     "mekf_predict_smoothed": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "orbit": {"r0_i": R_E, "v0_i": [-560.1, 3729.6, 6497.9]},
     "satellite": {
