@@ -1,12 +1,13 @@
 """Our satellite beside a real one, beside brahe, and what a field costs.
 
-    python benchmarks/real_orbit.py [real] [brahe] [kepler] [filter] [speed]
+    python benchmarks/real_orbit.py [real] [brahe] [kepler] [filter] [speed] [fmu]
 
 real: states of Sentinel-1A's orbit file (TERRAFIX_DATA), flown for 10 and 100 min at 70 x 70 with
 Sun, Moon, tide and radiation pressure, against the later states of the file.
 brahe: 24 hours of each force and of all, against brahe (installed with the tests).
 kepler: two bodies for ten days at 100 Hz, against Kepler's equation.
 filter: the open loop on five arcs of that file, with a field of degree 20 in the filter.
+fmu: the 20 x 20 orbit exported, its co-simulation and model exchange against the native one.
 speed: kernels compiled, and 100 members of TC-1 under a true field of 20 x 20, against J2.
 
 The surroundings are computed here, by ERFA from the tables of astropy-iers-data. Some ten minutes.
@@ -31,6 +32,9 @@ import numpy as np
 from terrafix.components.truth.satellite_orbit import SatelliteOrbit
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.engine.simulation import Simulation
+from terrafix.cosim.exchange.fmi.run.component import CO_SIMULATION, MODEL_EXCHANGE, Fmu
+from terrafix.cosim.exchange.fmi.write.export import export_fmu
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
 from terrafix.models.geometry.earth import EARTH
@@ -326,6 +330,38 @@ def speed() -> None:
     print(f"ratio {times['satellite, 20 x 20'] / times['orbit, J2']:.2f} (bar: 3)")
 
 
+def fmus() -> None:
+    r_e, v_e = np.array([-1104646.3, -6096830.4, 3395727.4]), np.array([-1004.7, 3648.9, 6498.0])
+    begin = {"start_from": "parameters", "r0_e": r_e, "v0_e": v_e}
+
+    def flown(component: Any) -> dict[str, Any]:
+        system = System("flown")
+        system.add(component, "orbit")
+        simulation = Simulation(system)
+        simulation.run_until("600")
+        slots = simulation.master.wiring.slots
+        found = {name: slots[f"orbit.{name}"].data[0].copy() for name in ("r_e", "v_e", "r_i")}
+        simulation.master.terminate()
+        return found
+
+    expected = flown(SatelliteOrbit(rate=Rate(hz=10), **begin))
+    for fmi in (2, 3):
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder, "orbit.fmu")
+            source = System("source")
+            source.add(SatelliteOrbit(rate=Rate(hz=10), **begin), "orbit")
+            made = _seconds(partial(export_fmu, source, file, component="orbit", fmi=fmi))
+            stepped = flown(Fmu(file=file, kind=CO_SIMULATION, rate=Rate(hz=10)))
+            settings: dict[str, Any] = {"kind": MODEL_EXCHANGE, "tolerance": 1e-13}
+            integrated = flown(Fmu(file=file, rate=Rate(hz=10), **settings))
+        same = all(stepped[n].tobytes() == expected[n].tobytes() for n in expected)
+        apart = np.linalg.norm(integrated["r_e"] - expected["r_e"])
+        print(
+            f"FMI {fmi}, 20 x 20, made in {made:.1f} s: co-simulation over 600 s "
+            f"{'has the same bits' if same else 'DIFFERS'}; model exchange is {apart:.1e} m off"
+        )
+
+
 def _compiled(degree: int) -> None:
     r_e, v_e = np.array([-1104646.3, -6096830.4, 3395727.4]), np.array([-1004.7, 3648.9, 6498.0])
     system = System("compiled", duration="1 s")
@@ -357,6 +393,7 @@ PARTS = {
     "kepler": kepler,
     "filter": filtered,
     "speed": speed,
+    "fmu": fmus,
 }
 
 
