@@ -53,6 +53,9 @@ benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/aircraft_images.py
 	$(BIN)/python benchmarks/aircraft.py
 	$(BIN)/python benchmarks/aircraft_flights.py --flights 2 --seconds 10
+	$(BIN)/python benchmarks/real_orbit.py brahe kepler speed fmu
+	@if test -d "$${TERRAFIX_DATA:-../shared/data}/sentinel1"; \
+	    then $(BIN)/python benchmarks/real_orbit.py real filter; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
 	    then $(BIN)/python benchmarks/real_echo.py; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/afrl_gotcha"; \

@@ -24,6 +24,13 @@ KNOWN_STATE = {
 }
 """A position and velocity known with a covariance."""
 
+AIR = {
+    "r_e": Field((3,), "m", "e", labels=XYZ, doc="where it holds"),
+    "log_density": Field((), "1", doc="natural logarithm of the density in kg/m^3"),
+    "gradient": Field((3,), "1/m", "e", labels=XYZ, doc="of that logarithm"),
+}
+"""Density of the air about a place."""
+
 ESTIMATE = {
     "r_e": Field((3,), "m", "e", labels=XYZ, doc="position"),
     "v_e": Field((3,), "m/s", "e", labels=XYZ, doc="velocity relative to the Earth"),

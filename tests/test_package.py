@@ -35,7 +35,7 @@ def test_the_wheel_is_the_house_and_flies_an_example(tmp_path):
         "components": "terrafix/components",
         "src/terrafix": "terrafix",
     }
-    kinds = {".py", ".c", ".h", ".j2", ".typed"}
+    kinds = {".py", ".c", ".h", ".j2", ".gfc", ".typed"}
     expected = {
         f"{name}/{path.relative_to(ROOT / folder).as_posix()}"
         for folder, name in wings.items()

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.components.fields import ESTIMATE, FIX, INNOVATION, KNOWN_STATE
+from terrafix.components.fields import ENVIRONMENT, ESTIMATE, FIX, INNOVATION, KNOWN_STATE
 from terrafix.components.filters.family import check_start, transition_ports
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.declare.parameters import Choice, Parameter
+from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
     BundleOutput,
@@ -33,6 +33,8 @@ from terrafix.models.filters.spacecraft import (
 from terrafix.models.filters.updates import UPDATES
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.motion.gravity import GRAVITY_MODELS
+from terrafix.models.motion.gravity_field import chosen_field
+from terrafix.models.motion.satellite import Forces
 from terrafix.models.sensors.sar import IN_TRACK
 
 
@@ -41,7 +43,11 @@ class MekfPredict(SymbolicComponent):
 
     default_rate = Rate(hz=100)
 
-    gravity = Choice(GRAVITY_MODELS, "j2", doc="gravity field of the filter")
+    gravity = Choice(
+        (*GRAVITY_MODELS, "harmonics"), "j2", doc="gravity field of the filter: harmonics of a file"
+    )
+    degree = Count(20, minimum=2, doc="and order of the harmonics")
+    gravity_file = OptionalFilePath(doc="field (.gfc) in place of EGM2008 to degree 70")
     transition = Choice(
         TRANSITIONS, "exact", doc="printed: the paper's, without Coriolis (negative control)"
     )
@@ -49,6 +55,7 @@ class MekfPredict(SymbolicComponent):
     radius = Parameter(EARTH.radius, unit="m", positive=True, doc="equatorial radius")
     j2 = Parameter(EARTH.j2, doc="second zonal coefficient")
     rotation_rate = Parameter(EARTH.rotation_rate, unit="rad/s", doc="Earth rotation")
+    pole = Parameter(0.0, shape=(2,), unit="rad", doc="polar motion x, y (harmonics)")
     accel_psd = Parameter(0.0, unit="m^2/s^3", minimum=0.0, doc="process noise of velocity")
     misalignment_psd = Parameter(
         0.0, unit="rad^2/s", minimum=0.0, doc="process noise of the misalignment"
@@ -61,13 +68,24 @@ class MekfPredict(SymbolicComponent):
     q_be = Input((4,), unit="1", frame="b", doc="measured attitude, Earth-fixed to body")
     prior = BundleOutput(ESTIMATE, doc="estimate before any fix of this instant")
 
+    def takes(self, name: str) -> bool:
+        """Whether a parameter has any effect, as the choices are now."""
+        if name in ("degree", "gravity_file"):
+            return bool(self.setting("gravity") == "harmonics")
+        return super().takes(name)
+
     def _initialize_impl(self) -> None:
         super()._initialize_impl()
         check_start(self)
 
     def build_model(self) -> Model:
         """Build the model for the chosen gravity and transition."""
-        return mekf_predict_model(self.gravity, self.transition)
+        return mekf_predict_model(self._field(), self.transition)
+
+    def _field(self) -> str | Forces:
+        if self.gravity != "harmonics":
+            return str(self.gravity)
+        return Forces(chosen_field(self.gravity_file, self.degree))
 
 
 class SmoothedMekfPredict(MekfPredict):
@@ -77,7 +95,20 @@ class SmoothedMekfPredict(MekfPredict):
 
     def build_model(self) -> Model:
         """Build the model for the chosen gravity and transition."""
-        return mekf_predict_model(self.gravity, self.transition, smoothed=True)
+        return mekf_predict_model(self._field(), self.transition, smoothed=True)
+
+
+class SurroundedMekfPredict(MekfPredict):
+    """Dead reckoning with harmonics, Sun, Moon and tide, about the axis that surroundings tell."""
+
+    gravity = Choice(("harmonics",), "harmonics", doc="gravity field of the filter")
+    tide = Flag(True, doc="tide of the solid Earth besides Sun and Moon")
+
+    surroundings = BundleInput(ENVIRONMENT, doc="rotation of the Earth, Sun and Moon")
+
+    def _field(self) -> Forces:
+        field = chosen_field(self.gravity_file, self.degree)
+        return Forces(field, sun=True, moon=True, tide=self.tide)
 
 
 class MekfCorrect(SymbolicComponent):

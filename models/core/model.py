@@ -10,9 +10,10 @@ A model is the map of one step of length :math:`\Delta t`,
 with states :math:`x`, inputs :math:`u`, parameters :math:`p` and standard normal noise
 :math:`w`. Outputs are functions of the state *at the end* of the step, as in FMI; at the start
 they are :math:`g(x_0, u, p, w, 0)`. Continuous models give :math:`\dot x` instead of :math:`x^+`
-and are integrated over the step by the classical Runge-Kutta method of order four. The symbol of
-time is the time *at the end* of the step in outputs and next states, and the running time in
-derivatives; inputs, parameters and noise are held.
+and are integrated over the step by the classical Runge-Kutta method of order four, unless they
+bring an integrator of their own (`flow`); others who integrate them go by :math:`\dot x`. The
+symbol of time is the time *at the end* of the step in outputs, next states and flow, and the
+running time in derivatives; inputs, parameters and noise are held.
 """
 
 from __future__ import annotations
@@ -80,6 +81,9 @@ class Model:
         from both `next` and `derivatives` is constant.
     derivatives : mapping of str to SX expression
         Time derivatives of continuous states, integrated by `rk4` over the step.
+    flow : mapping of str to SX expression
+        An integrator of their own in place of `rk4`: the same states at the end of the step, as
+        functions of all states at its start. All of them, or none.
     initial : mapping of str to SX expression
         The states at the start, functions of inputs, parameters and noise; zero where absent.
     step : SX symbol, optional
@@ -103,13 +107,14 @@ class Model:
     noise: Symbols = field(default_factory=dict)
     next: Symbols = field(default_factory=dict)
     derivatives: Symbols = field(default_factory=dict)
+    flow: Symbols = field(default_factory=dict)
     initial: Symbols = field(default_factory=dict)
     step: Any = None
     time: Any = None
     jacobians: Sequence[tuple[str, str]] = ()
 
     def __post_init__(self) -> None:
-        for kind in ("next", "derivatives", "initial"):
+        for kind in ("next", "derivatives", "flow", "initial"):
             for key, expression in getattr(self, kind).items():
                 if key not in self.states:
                     raise ValueError(
@@ -127,13 +132,18 @@ class Model:
                 f"model '{self.name}': {sorted(both)} are given both as next values and as "
                 "derivatives; a state is either discrete or continuous"
             )
+        if self.flow and set(self.flow) != set(self.derivatives):
+            raise ValueError(
+                f"model '{self.name}': flow integrates {sorted(self.flow)}, and derivatives are "
+                f"those of {sorted(self.derivatives)}; an integrator of its own takes all of them"
+            )
         known = {
             element.element_hash()
             for group in self._symbol_groups()
             for symbol in group.values()
             for element in ca.symvar(symbol)
         }
-        for kind in ("outputs", "next", "derivatives", "initial"):
+        for kind in ("outputs", "next", "derivatives", "flow", "initial"):
             for key, expression in getattr(self, kind).items():
                 for element in ca.symvar(ca.SX(expression)):
                     if element.element_hash() not in known:
@@ -149,7 +159,7 @@ class Model:
         """
         gone = [self.parameters[k] for k in zero]
         kinds: dict[str, Any] = {}
-        for kind in ("outputs", "next", "derivatives", "initial"):
+        for kind in ("outputs", "next", "derivatives", "flow", "initial"):
             expressions = [ca.SX(e) for e in getattr(self, kind).values()]
             if expressions:
                 expressions = ca.substitute(
@@ -180,7 +190,7 @@ class Model:
         symbol = ca.vec(self.parameters[parameter])
         expressions = [
             ca.vec(ca.densify(ca.SX(e)))
-            for kind in (self.outputs, self.next, self.derivatives, self.initial)
+            for kind in (self.outputs, self.next, self.derivatives, self.flow, self.initial)
             for e in kind.values()
         ]
         return bool(expressions) and bool(ca.depends_on(ca.vertcat(*expressions), symbol))
@@ -197,10 +207,10 @@ class Model:
     def _advanced(self) -> dict[str, Any]:
         """States at the end of the step, as expressions of those at its start."""
         advanced = {
-            key: ca.densify(ca.SX(self.next.get(key, symbol)))
+            key: ca.densify(ca.SX(self.flow.get(key, self.next.get(key, symbol))))
             for key, symbol in self.states.items()
         }
-        if self.derivatives:
+        if self.derivatives and not self.flow:
             if self.step is None:
                 raise ValueError(f"model '{self.name}' has derivatives but declares no step")
             keys = list(self.derivatives)

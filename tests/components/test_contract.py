@@ -121,6 +121,8 @@ INPUTS = {
     "sun_rate_e": (np.array([0.0, 3e4, 0.0]), 1.0),
     "moon_e": (R_E / -7e6 * 3.8e8, 1e3),
     "moon_rate_e": (np.array([0.0, 1e3, 0.0]), 1.0),
+    "log_density": (-31.0, 0.1),
+    "gradient": (-R_E / np.linalg.norm(R_E) / 7e4, 1e-7),
 }
 INERTIAL = {
     "velocity_random_walk": 1e-3,
@@ -129,6 +131,7 @@ INERTIAL = {
     "gyro_bias_sigma": 1e-5,
 }
 SETTINGS = {
+    "atmosphere": {"epoch": "2022-09-18T07:49:21 UTC", "f107": 140.0, "f107a": 130.0, "ap": 12.0},
     "antenna_mount": {"misalignment_sigma0": 1e-3, "misalignment_walk": 1e-4},
     "attitude_sensor": {"noise_sigma": 1e-4, "bias_sigma": 1e-3},
     "flight": {
@@ -148,12 +151,21 @@ SETTINGS = {
     "inertial_predict_radar": INERTIAL,
     "mekf_correct": {"look": 0.6},
     "mekf_predict": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
+    "mekf_predict_surrounded": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6, "degree": 3},
     "mekf_predict_smoothed": {"misalignment_sigma0": 1e-3, "accel_psd": 1e-6},
     "orbit": {"r0_i": R_E, "v0_i": [-560.1, 3729.6, 6497.9]},
     "orbit_start": {"frame": "gcrf", "r0": R_E, "v0": [-560.1, 3729.6, 6497.9]},
     "star_tracker": {"sun_exclusion": 0.0, "alignment_sigma": 1e-4},
     "sun_sensor": {"bias_sigma": 1e-3, "bias_time": 10.0},
     "horizon_sensor": {"bias_sigma": 1e-3, "bias_time": 10.0},
+    "satellite": {
+        "degree": 3,
+        **dict.fromkeys(("surrounded", "sun", "moon", "tide", "radiation"), True),
+        "drag": "atmosphere",
+        "ballistic_coefficient": 0.02,
+        "radiation_coefficient": 0.02,
+        "maneuvers": {"up": {"start": 0.3, "duration": 0.4, "delta_v": [1.0, 0.0, 0.0]}},
+    },
     "synthetic_sar_fix": {"look": 0.6},
 }
 RATES = dict.fromkeys(("last_known_state", "last_known_flight", "orbit_start"), Rate(times=["0"]))

@@ -1,5 +1,7 @@
 """What follows from a model's declaration."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -55,6 +57,32 @@ def test_time_in_a_derivative_runs_through_the_step():
         errors.append(abs(float(value[0]) - np.sin(10)))
     slopes = np.diff(np.log(errors)) / np.diff(np.log(steps))
     np.testing.assert_allclose(slopes, 4, atol=0.05)
+
+
+def test_an_integrator_of_its_own_takes_the_place_of_runge_kutta():
+    """Leapfrog of an oscillator, by its matrix; outputs, derivatives and errors as ever."""
+    x, h, k = ca.SX.sym("x", 2), ca.SX.sym("h"), ca.SX.sym("k")
+    half = x[1] - h / 2 * k * x[0]
+    there = x[0] + h * half
+    flow = ca.vertcat(there, half - h / 2 * k * there)
+    own = Model(
+        "leapfrog",
+        states={"x": x},
+        parameters={"k": k},
+        derivatives={"x": ca.vertcat(x[1], -k * x[0])},
+        flow={"x": flow},
+        step=h,
+    )
+    _, states = own.advance(x=[1.0, 0.0], k=4.0, step=0.1)
+    # cos of the step's angle is 1 - k h^2 / 2
+    np.testing.assert_allclose(states["x"], [0.98, -0.4 + 0.4 * 0.01], rtol=1e-14)
+    rate = own.rate_function()(x=[1.0, 0.5], k=4.0)["der_x_"].full().ravel()
+    assert rate.tolist() == [0.5, -4.0]
+    assert own.uses("k")
+    with pytest.raises(ValueError, match=r"flow integrates \['x'\], and derivatives are those of"):
+        replace(own, derivatives={})
+    with pytest.raises(ValueError, match="flow names 'y', which is no state"):
+        replace(own, flow={"y": flow})
 
 
 def test_start_evaluates_the_outputs_at_the_initial_states():
