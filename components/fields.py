@@ -240,17 +240,6 @@ HEIGHT_FIX = {
 }
 """What an altimeter measures."""
 
-ENVIRONMENT = {
-    "time": Field((), "s", doc="that the rest holds for"),
-    "omega_e": Field((3,), "rad/s", "e", labels=XYZ, doc="rotation of the Earth-fixed axes"),
-    "q_ei": Field((4,), "1", "e", doc="inertial (GCRF) to Earth-fixed (ITRF)"),
-    "sun_e": Field((3,), "m", "e", labels=XYZ, doc="Sun, from the Earth's center"),
-    "sun_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
-    "moon_e": Field((3,), "m", "e", labels=XYZ, doc="Moon, from the Earth's center"),
-    "moon_rate_e": Field((3,), "m/s", "e", labels=XYZ, doc="its inertial velocity"),
-}
-"""What surrounds a satellite, at the time of publication; turned inside models until the next."""
-
 STAR_FIX = {
     "q_bi": Field((4,), "1", "b", doc="measured attitude, inertial to body"),
     "R": Field((3, 3), "rad^2", "b", doc="covariance of its rotation error, in body axes"),

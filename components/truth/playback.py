@@ -22,10 +22,11 @@ from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.parameters import FilePath, Parameter, Text
+from terrafix.models.core.timescales import parse_epoch
+from terrafix.models.geometry.celestial import Turning
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import inertial_from_earth_fixed_array
 from terrafix.models.motion.ephemeris import Ephemeris
-from terrafix.models.motion.epochs import instant
 from terrafix.models.motion.orbits.files import read_orbit
 
 CLOSE = 1e-9  # [s] within which two times are the same: far below any step, far above rounding
@@ -133,8 +134,7 @@ class Recording:
         """
         if not self.epoch:
             raise ValueError(f"'{self.path.name}' was recorded without an epoch")
-        (day, seconds), (first, begin) = instant(epoch), instant(self.epoch)
-        return (day - first) * 86400.0 + (seconds - begin)
+        return float(parse_epoch(epoch).minus(parse_epoch(self.epoch)))
 
     def choose(self, members: NDArray[np.int64]) -> None:
         """Keep the members that are flown; the only one of a recording serves all."""
@@ -191,8 +191,8 @@ class RecordedOrbit(Component):
     From an orbit file of others (OEM, SP3-c, SP3-d, EOF, table), whose states are interpolated to
     the eighth order, or from a result of terrafix (.nc), played sample by sample. A run begins at
     the system's epoch, or where it has none `start` after the first state. What a file does not
-    hold is supplied: `delta_v_e` is zero, and inertial axes are the Earth-fixed ones of t = 0
-    turned by `earth_angle0`.
+    hold is supplied: `delta_v_e` is zero; inertial axes are GCRF in a system with an epoch, else
+    the Earth-fixed ones of t = 0 turned by `earth_angle0`.
     """
 
     default_rate = Rate(hz=100)
@@ -239,8 +239,15 @@ class RecordedOrbit(Component):
     def validate_epoch(self, epoch: str | None) -> None:
         """Look whether the file covers the epoch of the system."""
         self._epoch = epoch
-        if epoch is not None:
-            self._check_span(0.0)
+        if epoch is None:
+            return
+        for name in ("rotation_rate", "earth_angle0"):
+            if not self.is_default(name):
+                raise ConfigurationError(
+                    f"'{self.name}.{name}' is of axes that turn uniformly; in a system with the "
+                    f"epoch '{epoch}' inertial axes are those of GCRF\n  leave one of them out"
+                )
+        self._check_span(0.0)
 
     def validate_duration(self, duration: float) -> None:
         """Look whether the file covers the run."""
@@ -288,7 +295,7 @@ class RecordedOrbit(Component):
         try:
             if isinstance(orbit, Recording):
                 return orbit.since_start(epoch)
-            return orbit.since_first(*instant(epoch))
+            return orbit.since_first(parse_epoch(epoch))
         except (ValueError, ImportError) as error:
             raise ConfigurationError(f"'{self.name}' cannot be at {epoch}: {error}") from error
 
@@ -350,7 +357,8 @@ class RecordedOrbit(Component):
                     "from one time\n  disperse it with an orbit file, which is interpolated"
                 )
             alike = alike and len(self._orbit.members) == 1
-        epoch = getattr(self.environment, "epoch", None)
+        epoch = self.environment.epoch
+        self._turning = None if epoch is None else Turning(parse_epoch(epoch))
         since = 0.0 if epoch is None else self._first(self._orbit, epoch)
         self._begin = self.start + since
         # compute once for all members unless they differ
@@ -368,12 +376,20 @@ class RecordedOrbit(Component):
         else:
             self._interpolate(self._orbit, self._begin[self._who] + t)
         if "r_i" not in held or "v_i" not in held:
-            rate = self.rotation_rate[self._who]
-            angle = self.earth_angle0[self._who] + rate * t
-            r_e, v_e = self.r_e[self._who], self.v_e[self._who]
-            self.r_i, self.v_i = inertial_from_earth_fixed_array(r_e, v_e, angle, rate)
+            self._publish_inertial(t)
         if "delta_v_e" not in held:
             self.delta_v_e = 0.0
+
+    def _publish_inertial(self, t: float) -> None:
+        """Inertial states of the Earth-fixed ones: GCRF at an epoch, else of uniform rotation."""
+        r_e, v_e = self.r_e[self._who], self.v_e[self._who]
+        if self._turning is not None:
+            C, omega = self._turning.at(t)
+            self.r_i, self.v_i = r_e @ C, (v_e + np.cross(omega, r_e)) @ C
+            return
+        rate = self.rotation_rate[self._who]
+        angle = self.earth_angle0[self._who] + rate * t
+        self.r_i, self.v_i = inertial_from_earth_fixed_array(r_e, v_e, angle, rate)
 
     def _interpolate(self, orbit: Ephemeris, wanted: FloatArray) -> None:
         """Publish states at times of the file [s], of all members or one for all."""

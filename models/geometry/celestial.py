@@ -44,6 +44,10 @@ from terrafix.models.geometry.frames import (
     inertial_from_earth_fixed_array,
 )
 from terrafix.models.geometry.orientation import EarthOrientation, earth_orientation
+from terrafix.models.geometry.quaternion import (
+    from_rotation_vector_array,
+    rotation_matrix_array,
+)
 
 FRAMES = ("gcrf", "j2000", "teme", "tod", "itrf", "uniform")
 """Names of frames that a state may be given in."""
@@ -257,3 +261,34 @@ def _transposed(C: FloatArray) -> FloatArray:
 
 def _erfa() -> Any:
     return optional("erfa", "a frame of the sky")
+
+
+class Turning:
+    """How the Earth-fixed axes turn in a run, from instants that come one after the other.
+
+    The whole chain is evaluated every ten seconds, and turned about its rotation vector in between:
+    7e-14 rad off.
+
+    Parameters
+    ----------
+    start : Instant
+        Of t = 0.
+    """
+
+    def __init__(self, start: Instant) -> None:
+        self._start, self._number = start, -1
+
+    def at(self, t: float) -> tuple[FloatArray, FloatArray]:
+        """Matrix from GCRF to ITRF (3, 3), and the rotation vector (3,) [rad/s], at a time [s]."""
+        number = int(t // _SPAN)
+        if number != self._number:
+            instant = self._start.plus(number * _SPAN)
+            self._C = terrestrial_rotation(instant)
+            self._omega = rotation_vector_of_earth(instant)
+            self._number = number
+        turn = from_rotation_vector_array(self._omega * (t - number * _SPAN))
+        return np.asarray(rotation_matrix_array(turn) @ self._C), self._omega
+
+
+_SPAN = 10.0
+"""[s] within which the axes are turned about one vector."""

@@ -29,8 +29,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.formats import kind_of
+from terrafix.models.core.timescales import Instant
 from terrafix.models.geometry.earth import EARTH
-from terrafix.models.motion.epochs import atomic, day_and_seconds
+from terrafix.models.motion.epochs import atomic
 
 MAX_BYTES = 64 * 1024 * 1024
 """Largest orbit file read; a day of state vectors every 10 s takes 5 MB."""
@@ -61,8 +62,8 @@ class Ephemeris:
         Velocity relative to the rotating Earth [m/s], Earth-fixed.
     scale : str
         Time scale of the tags: "UTC", "GPS", "TAI" or "TT".
-    tai0 : datetime64[ns], optional
-        TAI of the first epoch, where it is known.
+    first : Instant, optional
+        The first epoch, where it is known without a table of leap seconds.
     ends : sequence of int
         Numbers of the states with which parts of a file end: what follows is not joined. The next
         part may begin at the same epoch, from which on it holds.
@@ -79,7 +80,7 @@ class Ephemeris:
     r_e: FloatArray
     v_e: FloatArray | None = None
     scale: str = "UTC"
-    tai0: np.datetime64 | None = None
+    first: Instant | None = None
     ends: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -144,23 +145,22 @@ class Ephemeris:
         tagged = self.tags[k] + np.timedelta64(round((t - self.t[k]) * 1e3), "ms")
         return f"{tagged.astype('datetime64[ms]')} {self.scale}"
 
-    def first_tai(self) -> np.datetime64:
-        """TAI of the first epoch.
+    def instant0(self) -> Instant:
+        """The first epoch.
 
         Raises
         ------
-        ModuleNotFoundError
-            If it is tagged in UTC alone, and pyerfa is not installed.
+        ImportError
+            If it is tagged in UTC alone, and the table of leap seconds is not installed.
         """
-        if self.tai0 is not None:
-            return self.tai0
-        tai0: np.datetime64 = atomic(self.tags[:1], np.zeros(1, np.bool_), self.scale)[0]
-        return tai0
+        if self.first is not None:
+            return self.first
+        found = atomic(self.tags[:1], np.zeros(1, np.bool_), self.scale)
+        return Instant(int(found.day[0]), float(found.seconds[0]))
 
-    def since_first(self, day: int, seconds: float) -> float:
-        """Seconds from the first epoch to an instant: modified Julian day of TAI, seconds of it."""
-        first_day, first_seconds = day_and_seconds(self.first_tai())
-        return (day - first_day) * 86400.0 + (seconds - first_seconds)
+    def since_first(self, instant: Instant) -> float:
+        """Seconds from the first epoch to an instant."""
+        return float(instant.minus(self.instant0()))
 
     # ------------------------------------------------------------------ interpolation
 
@@ -327,8 +327,8 @@ def read_eof(path: str | Path) -> Ephemeris:
             f"{path}: holds {len(vectors)} state vectors but declares {declared or 'no count'}"
         )
     utc = _epochs(path, vectors, "UTC")
-    atomic = [osv.find("TAI") is not None for osv in vectors]
-    if any(atomic):
+    tagged = [osv.find("TAI") is not None for osv in vectors]
+    if any(tagged):
         t = _seconds(_epochs(path, vectors, "TAI"))
         leaps = t - _seconds(utc)
         if np.any(leaps != np.round(leaps)) or np.any(np.diff(leaps) < 0):
@@ -350,8 +350,8 @@ def read_eof(path: str | Path) -> Ephemeris:
             "positions are in meters"
         )
     try:
-        tai0 = _epochs(path, vectors[:1], "TAI")[0] if any(atomic) else None
-        return Ephemeris(utc, t, states[:, :3].copy(), states[:, 3:].copy(), tai0=tai0)
+        first = _first(path, vectors) if any(tagged) else None
+        return Ephemeris(utc, t, states[:, :3].copy(), states[:, 3:].copy(), first=first)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -369,6 +369,11 @@ def _text(path: Path, index: int, osv: ET.Element, tag: str) -> str:
     if text is None or not text.strip():
         raise ValueError(f"{path}: state vector {index} has no {tag}")
     return text.strip()
+
+
+def _first(path: Path, vectors: list[ET.Element]) -> Instant:
+    found = atomic(_epochs(path, vectors[:1], "TAI"), np.zeros(1, np.bool_), "TAI")
+    return Instant(int(found.day[0]), float(found.seconds[0]))
 
 
 def _seconds(epochs: NDArray[np.datetime64]) -> FloatArray:

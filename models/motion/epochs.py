@@ -1,26 +1,19 @@
-"""Epochs as files tag them: time scales, the texts of calendars, and atomic time of both.
-
-GPS time is 19 s behind TAI and terrestrial time 32.184 s ahead of it; between UTC and TAI lie the
-leap seconds, of the table in pyerfa.
-"""
+"""Epochs as files tag them: time scales, the texts of calendars, and atomic time of both."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.timescales import Instant, tai_from
 
 SCALES = ("UTC", "GPS", "TAI", "TT")
 """Time scales that are read."""
-INSTALL = "pip install terrafix[truth]"
 
-_BEHIND = {"TAI": 0, "GPS": 19_000_000_000, "TT": -32_184_000_000}
-"""Of TAI, in nanoseconds."""
 _WRITTEN = re.compile(
     r"(\d{4})-(?:(\d\d)-(\d\d)|(\d{3}))[T ](\d\d):(\d\d):(\d\d)(?:\.(\d+))?Z?", re.ASCII
 )
@@ -84,86 +77,36 @@ def _read(text: str, scale: str) -> tuple[np.datetime64, bool]:
     return date + since + nanoseconds, leap
 
 
-def atomic(
-    tags: NDArray[np.datetime64], within: NDArray[np.bool_], scale: str
-) -> NDArray[np.datetime64]:
-    """TAI of tags (n,) in a time scale.
+def atomic(tags: NDArray[np.datetime64], within: NDArray[np.bool_], scale: str) -> Instant:
+    """Instants of tags (n,) in a time scale.
 
     Raises
     ------
     ValueError
-        If a tag is 23:59:60 where there is no leap second.
-    ModuleNotFoundError
-        If leap seconds are needed, and pyerfa is not installed.
+        If a tag is 23:59:60 where there is no leap second, or the table does not reach it.
+    ImportError
+        If leap seconds are needed, and their table is not installed.
     """
-    if scale != "UTC":
-        return np.asarray(tags + np.timedelta64(_BEHIND[scale], "ns"))
-    leap = leap_seconds(tags)
-    before = leap_seconds(tags - within * _SECOND)
-    wrong = within & (leap == before)
-    if wrong.any():
-        k = int(np.argmax(wrong))
-        raise ValueError(f"there is no leap second before {tags[k].astype('datetime64[D]')}")
-    counted = np.where(within, before, leap)
-    return np.asarray(tags + counted.astype("timedelta64[s]"))
-
-
-def leap_seconds(utc: NDArray[np.datetime64]) -> NDArray[np.int64]:
-    """Whole seconds that TAI is ahead of UTC, (n,), from 1972 on.
-
-    Raises
-    ------
-    ValueError
-        If an epoch is before 1972.
-    ModuleNotFoundError
-        If pyerfa is not installed.
-    """
-    try:
-        erfa = import_module("erfa")
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"leap seconds between UTC and TAI need pyerfa\n  {INSTALL}"
-        ) from error
-    table = erfa.leap_seconds.get()
-    since = [f"{row['year']:04d}-{row['month']:02d}-01" for row in table]
-    starts = np.array(since, "datetime64[ns]")
-    k = np.searchsorted(starts, utc, side="right") - 1
-    whole = table["tai_utc"]
-    first = int(np.argmax(whole == np.round(whole)))
-    if np.any(k < first):
-        raise ValueError(f"UTC before {since[first]} has no whole leap seconds")
-    return np.asarray(whole[k], np.int64)
+    # a leap second belongs to the day before
+    days = (tags - within * _SECOND - _MJD0) // _DAY
+    seconds = (tags - _MJD0 - days * _DAY).astype(np.int64) / 1e9
+    day = days.astype(np.int64)
+    found = tai_from(scale, day, seconds)
+    if within.any():
+        after = tai_from(scale, day + 1, np.zeros(len(day)))
+        wrong = within & ~(found.minus(after) < 0)
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            raise ValueError(f"there is no leap second before {tags[k].astype('datetime64[D]')}")
+    return found
 
 
 def seconds_since_first(
     tags: NDArray[np.datetime64], within: NDArray[np.bool_], scale: str
 ) -> FloatArray:
     """Seconds of tags (n,) since the first; the leap-second table is asked where it may matter."""
-    half_years = np.unique(tags.astype("datetime64[M]")).astype("datetime64[M]").astype(int) // 6
-    if scale != "UTC" or (len(np.unique(half_years)) == 1 and not within.any()):
+    half_years = np.unique(tags.astype("datetime64[M]").astype(int) // 6)
+    if scale != "UTC" or (len(half_years) == 1 and not within.any()):
         return np.asarray((tags - tags[:1]).astype(np.int64) / 1e9)
     tai = atomic(tags, within, scale)
-    return np.asarray((tai - tai[:1]).astype(np.int64) / 1e9)
-
-
-def instant(text: str) -> tuple[int, float]:
-    """TAI of an epoch, "2022-09-18T07:49:21.5 UTC", as modified Julian day and seconds of it.
-
-    Raises
-    ------
-    ValueError
-        If it is no epoch, or has no time scale that is read.
-    ModuleNotFoundError
-        If it is UTC, and pyerfa is not installed.
-    """
-    written, _, scale = text.strip().rpartition(" ")
-    if not written:
-        raise ValueError(f"'{text}' has no time scale; write 2022-09-18T07:49:21.5 UTC")
-    scale = scale_named(scale)
-    return day_and_seconds(atomic(*read_tags([written], scale), scale)[0])
-
-
-def day_and_seconds(tai: np.datetime64) -> tuple[int, float]:
-    """Modified Julian day, and seconds of it."""
-    day, rest = divmod(int((tai - _MJD0).astype(np.int64)), 86_400 * 10**9)
-    return day, rest / 1e9
+    return np.asarray(tai.minus(Instant(tai.day[0], tai.seconds[0])))

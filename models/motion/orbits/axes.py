@@ -6,9 +6,10 @@ import re
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.timescales import Instant
+from terrafix.models.geometry.celestial import earth_fixed_from_frame
 
 EARTH_FIXED = "itrf"
 INERTIAL = {
@@ -41,10 +42,7 @@ def frame_named(name: str) -> str:
 
 
 def to_earth_fixed(
-    frame: str,
-    epochs: Callable[[], NDArray[np.datetime64]],  # noqa: ARG001
-    r: FloatArray,
-    v: FloatArray | None,
+    frame: str, epochs: Callable[[], Instant], r: FloatArray, v: FloatArray | None
 ) -> tuple[FloatArray, FloatArray | None]:
     """Earth-fixed positions (n, 3) [m] and velocities [m/s] of states in a frame.
 
@@ -53,18 +51,18 @@ def to_earth_fixed(
     frame : str
         As `frame_named` has it.
     epochs : callable
-        Gives TAI of the states, (n,): only what turns needs it, and the table of leap seconds.
+        Gives the instants of the states, (n,): only what turns needs them, and the tables.
     r, v : ndarray, shape (n, 3)
         Velocities may be absent.
 
     Raises
     ------
     ValueError
-        If the frame is not read yet.
+        If an epoch lies outside the tables.
+    ImportError
+        If the extra ``truth`` is not installed.
     """
     if frame == EARTH_FIXED:
         return r, v
-    raise ValueError(
-        f"its states are in {frame.upper()}, which is not read yet\n"
-        "  have them written Earth-fixed (ITRF)"
-    )
+    r_e, v_e = earth_fixed_from_frame(frame, epochs(), r, np.zeros_like(r) if v is None else v)
+    return r_e, None if v is None else v_e

@@ -56,8 +56,8 @@ def read_orbit(path: str | Path, satellite: str = "") -> Ephemeris:
         If the file is of another kind, truncated or damaged, its epochs do not increase or are of
         several time scales, its frame is not read, or its states cannot be a satellite's; the
         message names the file.
-    ModuleNotFoundError
-        If leap seconds are needed, and pyerfa is not installed.
+    ImportError
+        If leap seconds or frames are needed, and the extra ``truth`` is not installed.
     OSError
         If it cannot be read.
     """
@@ -71,8 +71,8 @@ def read_orbit(path: str | Path, satellite: str = "") -> Ephemeris:
         if kind == "oem":
             return read_oem(path, satellite).ephemeris()
         return (read_sp3(path, satellite) if kind == "sp3" else read_table(path)).ephemeris()
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"{path}: {error}") from error
+    except ImportError as error:
+        raise ImportError(f"{path}: {error}") from error
     except ValueError as error:
         if str(error).startswith(str(path)):
             raise

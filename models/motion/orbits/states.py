@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.formats import kind_of
+from terrafix.models.core.timescales import Instant
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.motion.ephemeris import MAX_BYTES, Ephemeris
 from terrafix.models.motion.epochs import atomic, read_tags, seconds_since_first
@@ -70,23 +70,20 @@ class States:
         ------
         ValueError
             If an epoch or a state cannot be, or the frame is not read.
-        ModuleNotFoundError
-            If leap seconds are needed, and pyerfa is not installed.
+        ImportError
+            If leap seconds or frames are needed, and the extra ``truth`` is not installed.
         """
         tags, within = read_tags(self.tags, self.scale)
         t = seconds_since_first(tags, within, self.scale)
         self._check_distance()
         r, v = to_earth_fixed(self.frame, lambda: atomic(tags, within, self.scale), self.r, self.v)
-        made = Ephemeris(tags, t, r, v, self.scale, self._tai0(tags, within), self.ends)
+        first = None
+        if self.scale != "UTC":
+            known = atomic(tags[:1], within[:1], self.scale)
+            first = Instant(int(known.day[0]), float(known.seconds[0]))
+        made = Ephemeris(tags, t, r, v, self.scale, first, self.ends)
         check_motion(made)
         return made
-
-    def _tai0(
-        self, tags: NDArray[np.datetime64], within: NDArray[np.bool_]
-    ) -> np.datetime64 | None:
-        """TAI of the first state, where that takes no table."""
-        known = self.scale != "UTC" and len(tags)
-        return atomic(tags[:1], within[:1], self.scale)[0] if known else None
 
     def _check_distance(self) -> None:
         distance = np.linalg.norm(self.r, axis=1)
@@ -139,7 +136,7 @@ def check_motion(orbit: Ephemeris) -> None:
 
 
 def _check_velocities(orbit: Ephemeris, v_e: FloatArray) -> None:
-    alone = Ephemeris(orbit.tags, orbit.t, orbit.r_e, None, orbit.scale, orbit.tai0, orbit.ends)
+    alone = Ephemeris(orbit.tags, orbit.t, orbit.r_e, None, orbit.scale, orbit.first, orbit.ends)
     inner = np.arange(3, len(orbit.t) - 3)
     inner = inner[orbit.known[inner - 1] & orbit.known[inner]]
     if not len(inner):

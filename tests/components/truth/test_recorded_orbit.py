@@ -10,9 +10,10 @@ from terrafix import components
 from terrafix.components.truth.playback import Recording
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
-from terrafix.cosim.declare.component import Environment
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.system.system import System
+from terrafix.models.core.timescales import parse_epoch
+from terrafix.models.geometry.celestial import frame_from_earth_fixed
 
 MINUTE = np.arange(0.0, 3601.0, 60.0)
 
@@ -74,16 +75,24 @@ def test_states_too_far_apart_are_refused(tmp_path):
     simulate(system_of(path, start="4000 s", interpolation_error="200 m"))
 
 
-def test_a_run_begins_at_the_epoch_of_its_system(tmp_path, monkeypatch):
-    """Ten minutes after the first state of a file of GPS time; UTC is 18 s behind it."""
+def test_a_run_begins_at_the_epoch_of_its_system(tmp_path):
+    """Ten minutes after the first state of a file in GPS time, told in UTC, which is 18 s behind.
+
+    Inertial states are those of GCRF, by the whole chain.
+    """
     path = tmp_path / "a.oem"
     path.write_text(HEAD + oem(MINUTE, scale="GPS"))
-    epoch = f"{FIRST + np.timedelta64(600 - 18, 's')} UTC"
     system = system_of(path)
-    monkeypatch.setattr(Environment, "epoch", epoch, raising=False)
-    found = simulate(system).dataset["orbit.r_e"]
-    r, _ = states(600.0 + found[found.dims[0]].to_numpy())
-    assert np.abs(found[:, 0] - r).max() < 5e-5
+    system.epoch = f"{FIRST + np.timedelta64(600 - 18, 's')} UTC"
+    system.record("inertial", [system.nodes["orbit"][n] for n in ("r_i", "v_i")])
+    found = simulate(system).dataset
+    t = found["orbit.r_e"][found["orbit.r_e"].dims[0]].to_numpy()
+    r, v = states(600.0 + t)
+    assert np.abs(found["orbit.r_e"][:, 0] - r).max() < 5e-5
+    instants = parse_epoch(system.epoch).plus(t)
+    r_i, v_i = frame_from_earth_fixed("gcrf", instants, r, v)
+    assert np.abs(found["orbit.r_i"][:, 0] - r_i).max() < 5e-5
+    assert np.abs(found["orbit.v_i"][:, 0] - v_i).max() < 5e-6
 
 
 def _check(orbit, epoch):
@@ -99,7 +108,8 @@ def _check(orbit, epoch):
         ("2022-09-18T05:31:50 GPS", {}, "is to play 0 s from 2022-09-18T05:31:50 GPS on"),
         ("2022-09-18T05:40:00 GPS", {"start": "1 s"}, "'orbit.start' is 1 s, but the run begins"),
         ("2022-09-18T05:40:00", {}, "cannot be at 2022-09-18T05:40:00: "),
-        ("2022-09-18T23:59:60 UTC", {}, "there is no leap second before 2022-09-19"),
+        ("2022-09-18T23:59:60 UTC", {}, "does not exist: there was no leap second"),
+        ("2022-09-18T05:40:00 GPS", {"earth_angle0": 0.1}, "of axes that turn uniformly"),
     ],
 )
 def test_an_epoch_that_cannot_be_is_refused(tmp_path, epoch, settings, message):

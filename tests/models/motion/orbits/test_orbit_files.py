@@ -9,16 +9,13 @@ import sys
 
 import numpy as np
 import pytest
-from orbit_files import FIRST, HEAD, oem, oem_xml, sp3, states, table
+from orbit_files import FIRST, HEAD, oem, oem_xml, sp3, states, table, tags
 
+from terrafix.models.core.iers import leap_seconds
+from terrafix.models.core.timescales import parse_epoch
+from terrafix.models.geometry.celestial import frame_from_earth_fixed
 from terrafix.models.motion.ephemeris import Ephemeris
-from terrafix.models.motion.epochs import (
-    atomic,
-    day_and_seconds,
-    instant,
-    leap_seconds,
-    read_tags,
-)
+from terrafix.models.motion.epochs import atomic, read_tags
 from terrafix.models.motion.orbits.files import read_orbit
 
 MINUTE = np.arange(0.0, 3601.0, 60.0)
@@ -72,8 +69,8 @@ def test_a_file_gives_back_the_orbit_it_was_made_of(tmp_path, name, text, r_erro
 def test_the_error_that_is_stated_is_the_error_that_is_made(spacing, kind, velocities, least, most):
     t = np.arange(24 if spacing < 900.0 or kind == "gnss" else 14) * spacing
     r, v = states(t, kind)
-    tags = FIRST + (t * 1e9).astype("timedelta64[ns]")
-    orbit = Ephemeris(tags, t, r, v if velocities else None)
+    at = FIRST + (t * 1e9).astype("timedelta64[ns]")
+    orbit = Ephemeris(at, t, r, v if velocities else None)
     middle = t[4:-5] + spacing / 2
     inner = np.linalg.norm(orbit.at(middle)[0] - states(middle, kind)[0], axis=1).max()
     assert least <= inner < most
@@ -87,19 +84,16 @@ def test_every_time_scale_is_turned_to_tai(tmp_path):
     behind = {"GPS": 19.0, "TAI": 0.0, "TT": -32.184, "UTC": 37.0}
     for scale, shift in behind.items():
         orbit = read_orbit(written(tmp_path, HEAD + oem(MINUTE, scale=scale)))
-        day, seconds = day_and_seconds(orbit.first_tai())
-        assert (day, round(seconds, 6)) == (59840, 5 * 3600 + 31 * 60 + 55.5 + shift)
-        assert orbit.since_first(*instant(f"2022-09-18T05:32:55.5 {scale}")) == 60.0
+        first = orbit.instant0()
+        assert (first.day, round(first.seconds, 6)) == (59840, 5 * 3600 + 31 * 60 + 55.5 + shift)
+        assert orbit.since_first(parse_epoch(f"2022-09-18T05:32:55.5 {scale}")) == 60.0
 
 
-def test_leap_seconds_of_the_table():
-    """TAI - UTC of IERS Bulletin C: 10 s from 1972, 34 s in 2010, 37 s since 2017."""
-    utc = np.array(["1972-01-01", "2010-06-01", "2016-12-31T23:59:59", "2017-01-01"], "M8[ns]")
-    np.testing.assert_array_equal(leap_seconds(utc), [10, 34, 36, 37])
+def test_tags_within_a_leap_second():
+    """TAI - UTC is 36 s until it is over, 37 s then (IERS Bulletin C 52)."""
     tai = atomic(*read_tags(["2016-12-31T23:59:60.5", "2017-001T00:00:00.25Z"], "UTC"), "UTC")
-    np.testing.assert_array_equal(
-        tai, np.array(["2017-01-01T00:00:36.5", "2017-01-01T00:00:37.25"], "M8[ns]")
-    )
+    np.testing.assert_array_equal(tai.day, [57754, 57754])
+    np.testing.assert_array_equal(tai.seconds, [36.5, 37.25])
 
 
 def test_a_file_over_a_leap_second_goes_on(tmp_path):
@@ -114,12 +108,39 @@ def test_a_file_over_a_leap_second_goes_on(tmp_path):
     np.testing.assert_array_equal(orbit.t, t)
 
 
-def test_without_the_table_of_leap_seconds_only_what_needs_it_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "erfa", None)
+def test_without_the_tables_only_what_needs_them_is_refused(tmp_path, monkeypatch):
+    leap_seconds.cache_clear()
+    monkeypatch.setitem(sys.modules, "astropy_iers_data", None)
     orbit = read_orbit(written(tmp_path, HEAD + oem(MINUTE)))
     np.testing.assert_array_equal(orbit.t, MINUTE)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install terrafix\[truth\]"):
-        orbit.first_tai()
+    with pytest.raises(ImportError, match=r"pip install 'terrafix\[truth\]'"):
+        orbit.instant0()
+    inertial = written(tmp_path, HEAD + oem(MINUTE, frame="GCRF"))
+    with pytest.raises(ImportError, match=r"orbit.oem: .*needs the package"):
+        read_orbit(inertial)
+
+
+@pytest.mark.parametrize(
+    ("name", "frame"), [("GCRF", "gcrf"), ("EME2000", "j2000"), ("TEME", "teme")]
+)
+@pytest.mark.parametrize("velocities", [True, False])
+def test_states_of_inertial_frames_are_turned_with_the_earth(tmp_path, name, frame, velocities):
+    """Written in a frame by the whole chain, read back: to the digits of the file."""
+    r, v = states(MINUTE)
+    first = parse_epoch("2022-09-18T05:31:55.5 UTC")
+    r_i, v_i = frame_from_earth_fixed(frame, first.plus(MINUTE), r, v)
+    rows = [
+        ",".join([tag, *(f"{x:.9f}" for x in (*p, *(u if velocities else ())))])
+        for tag, p, u in zip(tags(MINUTE), r_i, v_i, strict=True)
+    ]
+    columns = "x [m],y [m],z [m]" + ",vx [m/s],vy [m/s],vz [m/s]" * velocities
+    text = f"# frame: {name}\nutc,{columns}\n" + "\n".join(rows) + "\n"
+    orbit = read_orbit(written(tmp_path, text, "orbit.csv"))
+    np.testing.assert_allclose(orbit.r_e, r, atol=1e-8)
+    if velocities:
+        np.testing.assert_allclose(orbit.v_e, v, atol=1e-8)
+    else:
+        assert np.linalg.norm(orbit.at(MINUTE)[1] - v, axis=1).max() < 1e-5
 
 
 @pytest.mark.parametrize("lost", [{20, 21, 22}, {20, 21}])
@@ -199,8 +220,7 @@ BAD = [
     ("orbit.oem", HEAD + oem(MINUTE, unit=1e6), "inside the Earth"),
     ("orbit.oem", HEAD + oem(MINUTE, unit=1.0), "beyond what orbits the Earth"),
     ("orbit.oem", HEAD + oem(MINUTE, turning=False), "not those of|move as in inertial axes"),
-    ("orbit.oem", HEAD + oem(MINUTE, frame="EME2000"), "in J2000, which is not read yet"),
-    ("orbit.oem", HEAD + oem(MINUTE, frame="TEME"), "in TEME, which is not read yet"),
+    ("orbit.oem", HEAD + oem(MINUTE, frame="EME2000"), "not move as a satellite|not those of its"),
     ("orbit.oem", HEAD + oem(MINUTE, frame="MOON_ME"), "its frame is 'MOON_ME', known are ITRF"),
     ("orbit.oem", HEAD + oem(MINUTE, scale="TDB"), "its time scale is 'TDB', read are UTC, GPS"),
     ("orbit.oem", HEAD + oem(MINUTE) + oem(MINUTE + 3660, scale="GPS"), "mixes time scales: GPS"),
