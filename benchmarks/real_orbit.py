@@ -138,9 +138,9 @@ def fly(
 
 def real() -> None:
     orbit = read_eof(ORBIT)
-    at = surroundings(orbit.utc[0])
+    at = surroundings(orbit.tags[0])
     forces = Forces(shipped_field(), sun=True, moon=True, tide=True, radiation=True)
-    print(f"Sentinel-1A from {orbit.utc[0]} UTC, {shipped_field()}, Sun, Moon, tide, radiation")
+    print(f"Sentinel-1A from {orbit.tags[0]} UTC, {shipped_field()}, Sun, Moon, tide, radiation")
     print("distance to the file's later states [m]; brahe's with the same forces, and with step 2")
     print("of the tide, the pole tide, relativity and drag (Harris-Priester, 6 m^2) besides")
     columns = ("start [s]", "10 min", "100 min", "brahe 10 min", "100 min", "more 100 min")
@@ -154,7 +154,7 @@ def real() -> None:
         wanted = [orbit.r_e[k + int(mark) // 10] for mark in marks]
         apart = [np.linalg.norm(flown[m][0] - r) for m, r in zip(marks, wanted, strict=True)]
         for more in (False, True):
-            theirs = _by_brahe(np.concatenate(state), orbit.utc[k], marks, more)
+            theirs = _by_brahe(np.concatenate(state), orbit.tags[k], marks, more)
             apart += [np.linalg.norm(x - r) for x, r in zip(theirs, wanted, strict=True)]
         shown = [apart[i] for i in (0, 1, 2, 3, 5)]
         print(f"{start:12d} " + " ".join(f"{x:12.3f}" for x in shown), flush=True)
