@@ -393,8 +393,8 @@ class Capabilities:
     deterministic : bool
         The same inputs and seed give the same bytes.
     given : bool
-        It reads nothing and draws no noise: what it publishes follows from the time and its
-        parameters, so that nothing of it deviates between members.
+        It draws no noise: what it publishes follows from the time, its parameters and what it
+        reads, and where it reads nothing, nothing of it deviates but with dispersed parameters.
     """
 
     state: bool = True

@@ -17,6 +17,8 @@ step, through the connections. The error of the estimate is one more linear func
 so its covariance is that of a campaign's sample whether or not the filter's model is the truth's;
 what the filter itself predicts is its covariance in the nominal run.
 
+What can only be stepped has no Jacobian, and is taken where no noise reaches it: `shadows`.
+
 Matrices (an estimate's covariance, a fix's) are not deviated: gains are those of the nominal run.
 A deviation of a gain acts on the nominal innovation, which is zero where the filter's model of
 the mean is the truth's.
@@ -25,6 +27,7 @@ the mean is the truth's.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -32,9 +35,9 @@ from numpy.typing import NDArray
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Exact, seconds
-from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.errors import ConfigurationError, StepError
 from terrafix.cosim.engine.simulation import Simulation
-from terrafix.cosim.lincov.jacobians import Call, Key, Listener, Notes, error_jacobian
+from terrafix.cosim.lincov.jacobians import Call, Key, Linear, Listener, Notes, error_jacobian
 from terrafix.cosim.lincov.layout import Layout, Wires
 from terrafix.cosim.lincov.observability import directions
 from terrafix.cosim.lincov.prediction import LinearCovariance
@@ -55,7 +58,8 @@ def linear_covariance(system: System, *, duration: Exact | None = None) -> Linea
     Parameters
     ----------
     system : System
-        Of symbolic components, and one evaluation that offers an `error_model`.
+        Of symbolic components, others that no noise reaches (an orbit from an FMU, say), and one
+        evaluation that offers an `error_model`.
     duration : exact time, optional
         [s]; the system's own if absent.
 
@@ -63,13 +67,21 @@ def linear_covariance(system: System, *, duration: Exact | None = None) -> Linea
     ------
     ConfigurationError
         If a component cannot be linearized; it is named.
+    StepError
+        If the nominal run fails, or a member flown beside it.
     """
     length = system.duration if duration is None else seconds(duration, "duration")
     if length is None:
         raise ConfigurationError(f"system '{system.name}' has no duration; give one")
-    simulation = Simulation(system, members=1, duration=length, recording=False, quiet=True)
+    made = partial(Simulation, system, duration=length, recording=False, quiet=True)
+    simulation = made(members=1)
     try:
-        analysis = _Analysis(simulation)
+        wires = Wires(simulation.plan, system.name)
+        if wires.shadows.n_members > 1:
+            simulation.master.terminate()
+            simulation = made(members=wires.shadows.n_members)
+            wires = Wires(simulation.plan, system.name)
+        analysis = _Analysis(simulation, wires)
         analysis.fly(simulation.master.ticks(length))
         result = analysis.result()
     finally:
@@ -97,16 +109,18 @@ class _Steps(NamedTuple):
 class _Analysis:
     """Deviations of one system, and how they move."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: Simulation, wires: Wires) -> None:
         self._simulation = simulation
-        self._wires = Wires(simulation.plan, simulation.system.name)
-        self._error_jacobian = error_jacobian(self._wires.error_model)
-        self._layout = Layout(simulation.plan, self._wires)
+        self._wires = wires
+        self._error_jacobian = error_jacobian(wires.error_model)
+        self._layout = Layout(simulation.plan, wires)
+        wires.shadows.spread(self._layout.sigma())
         self._notes = Notes()
         self._noted: list[_Noted] = []
         self._errors: list[dict[str, FloatArray]] = []
         for linear in self._layout.linear.values():
-            linear.component.call = Listener(linear, self._notes)
+            if isinstance(linear, Linear):
+                linear.component.call = Listener(linear, self._notes)
 
     # ------------------------------------------------------------------ the nominal run
 
@@ -153,21 +167,46 @@ class _Analysis:
 
     def _regular(self, number: int) -> bool:
         """Whether the components that step with a group publish signals alone."""
-        linear, group_of = self._layout.linear, self._simulation.master.group_of
-        mine = [path for path, group in group_of.items() if group == number]
-        return bool(mine) and all(p in linear and not linear[p].component.messages for p in mine)
+        components, group_of = (
+            self._simulation.plan.flat.components,
+            self._simulation.master.group_of,
+        )
+        mine = [components[path] for path, group in group_of.items() if group == number]
+        ports = [port for component in mine for port in component.outputs().values()]
+        return (
+            bool(mine)
+            and self._wires.evaluation not in mine
+            and all(port.kind != "message" for port in ports)
+        )
 
     def _note(self, tick: int, repeat: int) -> None:
         """Fly to a tick, noting the Jacobians of all steps, which are made there alone."""
+        master = self._simulation.master
+        due = [number for number, g in enumerate(master.agenda.groups) if g.next_tick == tick]
         self._notes.listening, self._notes.calls = True, []
-        self._simulation.master.run_until(tick)
+        master.run_until(tick)
         self._notes.listening = False
-        self._noted.append(_Noted(self._notes.calls, repeat))
+        self._refuse_lost()
+        stepped = [
+            Call(path, each.jacobian(), ())  # before what reads it; it reads parameters alone
+            for path, each in self._layout.stepped.items()
+            if each.written and master.group_of[path] in due
+        ]
+        self._noted.append(_Noted([*stepped, *self._notes.calls], repeat))
         if tick in self._epochs:
             self._move()
             self._evaluate()
         elif len(self._noted) > AT_ONCE:
             self._move()
+
+    def _refuse_lost(self) -> None:
+        """Refuse to go on without one of the members that are compared."""
+        master = self._simulation.master
+        for lost in (*master.excluded, *master.ended):
+            raise StepError(
+                f"'{lost['component']}' at t = {lost['t_s']:.9g} s, in a member with a parameter "
+                f"beside its nominal value: {lost['reason']}\n  fly a campaign instead"
+            )
 
     # ------------------------------------------------------------------ moving
 
@@ -311,10 +350,11 @@ class _Analysis:
         for name in model.inputs:
             size = int(np.prod(model.shape(name)))
             found = wires.source(wires.evaluation_path, name)
-            assert found is not None
-            key, factor = wires.slot_of(wires.evaluation_path, name), found[1]
-            if key in layout.place:
-                block = jacobian[:, column : column + size]
+            if (
+                found is not None
+                and (key := wires.slot_of(wires.evaluation_path, name)) in layout.place
+            ):
+                block, factor = jacobian[:, column : column + size], found[1]
                 E[:, layout.place[key]] += block if factor is None else block * factor
             column += size
         S = E @ self._S

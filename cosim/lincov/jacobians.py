@@ -135,8 +135,8 @@ class Evaluation:
         self._buffer, self._evaluate = function.buffer()
         self._kept = (function, arguments)
         self._result = np.zeros((columns, rows))  # CasADi's order
-        for i, array in enumerate(arguments):
-            self._buffer.set_arg(i, array.reshape(-1).data)
+        for i, array in enumerate(arguments):  # of the first member
+            self._buffer.set_arg(i, array[:1].reshape(-1).data)
         self._buffer.set_res(0, self._result.data)
 
     def __call__(self) -> FloatArray:
@@ -168,9 +168,9 @@ class Listener(BoundKernel):
 
     def __call__(self, step: int) -> int:
         """Step."""
-        if not self._notes.listening:
+        if not self._notes.listening or self._jacobian is None:
             return self._kernel(step)
-        jacobian = np.zeros((0, 0)) if self._jacobian is None else self._jacobian()
+        jacobian = self._jacobian()
         failed = self._kernel(step)
         published = tuple(bool(f[0] > 0.5) for f in self._linear.component.messages.values())
         self._notes.calls.append(Call(self._linear.path, jacobian, published))

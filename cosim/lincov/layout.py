@@ -11,8 +11,10 @@ from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.evaluation import Evaluation
+from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.lincov.jacobians import Key, Linear
+from terrafix.cosim.lincov.shadows import Shadows, Stepped
 from terrafix.cosim.system.check import Plan
 from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.cosim.system.wiring import port_factor
@@ -20,6 +22,15 @@ from terrafix.cosim.system.wiring import port_factor
 
 class Wires:
     """Where the inputs of a system come from.
+
+    Attributes
+    ----------
+    symbolic : dict of str to SymbolicComponent
+    stepped : list of str
+        Others that deviate, with dispersed parameters alone.
+    dispersed : dict of Key to list of Dispersion
+    shadows : Shadows
+        Members that show how they do.
 
     Raises
     ------
@@ -48,12 +59,52 @@ class Wires:
         for path, component in self._components.items():
             if isinstance(component, SymbolicComponent) and component.capabilities.symbolic:
                 self.symbolic[path] = component
-            elif component is not self.evaluation and not _given(component):
-                raise ConfigurationError(
-                    f"'{path}' ({type(component).__name__}) has no symbolic Jacobian, as all that "
-                    "can only be stepped (FMUs, components in Python), so the system cannot be "
-                    "linearized\n  fly a campaign instead, which takes its dispersions"
+            elif component is not self.evaluation and not component.capabilities.given:
+                raise _refused(path, component, "may draw noise of its own")
+        self.dispersed: dict[Key, list[Dispersion]] = {}
+        for d in plan.flat.dispersions:
+            for target in d.targets:
+                self.dispersed.setdefault(("parameter", *_split(target)), []).append(d)
+        self._sources: dict[str, list[str]] = {path: [] for path in self._components}
+        for target, c in self._connections.items():
+            self._sources[_split(target)[0]].append(_split(c.source)[0])
+        self.stepped: list[str] = []
+        shadowed: set[Key] = set()
+        for path in self._components:
+            if path not in self.symbolic and path != self.evaluation_path:
+                self._refuse_noise(path)
+                upstream = self._upstream(path)
+                keys = {k for k in self.dispersed if k[1] in upstream and self._is_parameter(k)}
+                self.stepped += [path] if keys else []
+                shadowed |= keys
+        self.shadows = Shadows(self._components, [k for k in self.dispersed if k in shadowed])
+
+    def _upstream(self, path: str) -> list[str]:
+        """A component, and whatever reaches it through connections, the nearest first."""
+        found, seen = [path], {path}
+        for owner in found:  # which grows
+            more = [s for s in dict.fromkeys(self._sources[owner]) if s not in seen]
+            found += more
+            seen.update(more)
+        return found
+
+    def _refuse_noise(self, path: str) -> None:
+        """Refuse a component without a Jacobian if noise reaches it."""
+        for name in self._components[path].inputs():
+            connection = self._connections.get(f"{path}.{name}")
+            if connection is None:
+                continue
+            upstream = self._upstream(_split(connection.source)[0])
+            noisy = [p for p in upstream if p in self.symbolic and self.symbolic[p].model.noise]
+            if noisy:
+                why = (
+                    f"its input '{name}' reads '{connection.source}', which deviates with the "
+                    f"noise of '{noisy[0]}'"
                 )
+                raise _refused(path, self._components[path], why)
+
+    def _is_parameter(self, key: Key) -> bool:
+        return isinstance(self._components[key[1]].settings().get(key[2]), Parameter)
 
     def source(self, path: str, name: str) -> tuple[Key, FloatArray | None] | None:
         """Where an input comes from, and its unit conversion; None if it does not deviate."""
@@ -62,7 +113,7 @@ class Wires:
         if connection is None:
             return None
         owner, _, port_name = connection.source.rpartition(".")
-        if owner not in self.symbolic:
+        if owner not in self.symbolic and owner not in self.stepped:
             return None
         port = self._components[path].ports[head]
         if connection.delay or port.window or port.queue > 1:
@@ -108,9 +159,18 @@ class Wires:
         return found
 
 
-def _given(component: Component) -> bool:
-    """Whether what it publishes is the same whatever deviates."""
-    return component.capabilities.given and not component.inputs()
+def _split(port: str) -> tuple[str, str]:
+    """The component, and the name in it."""
+    owner, _, name = port.rpartition(".")
+    return owner, name
+
+
+def _refused(path: str, component: Component, why: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"'{path}' ({type(component).__name__}) has no symbolic Jacobian, as all that can only be "
+        f"stepped (FMUs, components in Python), and {why}, so the system cannot be linearized\n"
+        "  fly a campaign instead, which takes its dispersions"
+    )
 
 
 def _part(port: Any, tail: str, factor: FloatArray) -> FloatArray | None:
@@ -127,7 +187,7 @@ class Layout:
 
     Attributes
     ----------
-    linear : dict of str to Linear
+    linear : dict of str to Linear or Stepped
     place : dict of Key to slice
     size : int
         Of z.
@@ -143,22 +203,30 @@ class Layout:
     """
 
     def __init__(self, plan: Plan, wires: Wires) -> None:
-        dispersed: dict[Key, Dispersion] = {}
-        for d in plan.flat.dispersions:
-            for target in d.targets:
-                owner, _, name = target.rpartition(".")
-                dispersed["parameter", owner, name] = d
         read = wires.outputs_read()
-        self.linear = {
-            path: Linear(
+        self.stepped = {
+            path: Stepped(
+                path,
+                plan.flat.components[path],
+                read.get(path, ()),
+                [key[2] for key in wires.shadows.numbers if key[1] == path],
+                wires.shadows,
+            )
+            for path in wires.stepped
+        }
+        self.linear: dict[str, Linear | Stepped] = {**self.stepped}
+        for path, component in wires.symbolic.items():
+            self.linear[path] = Linear(
                 path,
                 component,
                 wires.inputs(path),
                 [*read.get(path, ())],
-                [n for n in component.model.parameters if ("parameter", path, n) in dispersed],
+                [
+                    n
+                    for n in component.model.parameters
+                    if ("parameter", path, n) in wires.dispersed
+                ],
             )
-            for path, component in wires.symbolic.items()
-        }
         self.place: dict[Key, slice] = {}
         self.held: dict[Key, tuple[Key, FloatArray | None]] = {}
         self.sources: list[str] = []
@@ -177,7 +245,10 @@ class Layout:
                 self.sources += [f"{path}.{name} at the start", f"{path}.{name}"]
                 self._draw(f"{path}.{name} at the start", np.eye(linear.sizes[name]))
         self.held = {key: found for key, found in self.held.items() if found[0] in self.place}
-        self._disperse(plan, dispersed)
+        self.effects: list[tuple[Key, str, FloatArray]] = []
+        for key, several in wires.dispersed.items():
+            for d in several:
+                self._disperse(key, d, plan.flat.components)
 
     def _room(self, key: Key, size: int) -> None:
         if key not in self.place:
@@ -189,25 +260,31 @@ class Layout:
         self.draws[source] = (slice(self.n_draws, self.n_draws + n), covariance)
         self.n_draws += n
 
-    def _disperse(self, plan: Plan, dispersed: Mapping[Key, Dispersion]) -> None:
-        """Give dispersed parameters their places; targets of one dispersion take the same draw."""
-        self.effects: list[tuple[Key, str, FloatArray]] = []
-        for key, d in dispersed.items():
-            _, owner, name = key
-            linear = self.linear.get(owner)
-            if linear is None or name not in linear.parameters:
-                raise ConfigurationError(
-                    f"dispersion '{d.name}' feeds '{owner}.{name}', which is no parameter of a "
-                    "symbolic model, so that its effect cannot be linearized\n"
-                    "  fly a campaign instead"
-                )
-            self._room(key, linear.sizes[name])
-            nominal = linear.component.arguments()[name].reshape(-1)
-            source = f"dispersion {d.name}"
-            if source not in self.draws:
-                self.sources.append(source)
-                self._draw(source, _covariance(d, plan.flat.components, len(nominal)))
-            self.effects.append((key, source, _effect(d, nominal)))
+    def _disperse(self, key: Key, d: Dispersion, components: Mapping[str, Component]) -> None:
+        """Give a dispersed parameter its place; targets of one dispersion take the same draw."""
+        _, owner, name = key
+        linear = self.linear.get(owner)
+        if linear is None or name not in linear.parameters:
+            raise ConfigurationError(
+                f"dispersion '{d.name}' feeds '{owner}.{name}', which is no parameter of a "
+                "symbolic model, so that its effect cannot be linearized\n"
+                "  fly a campaign instead"
+            )
+        self._room(key, linear.sizes[name])
+        nominal = linear.component.parameter_values[name][0].reshape(-1)
+        source = f"dispersion {d.name}"
+        if source not in self.draws:
+            self.sources.append(source)
+            self._draw(source, _covariance(d, components, len(nominal)))
+        self.effects.append((key, source, _effect(d, nominal)))
+
+    def sigma(self) -> dict[Key, FloatArray]:
+        """Standard deviation of the numbers of every dispersed parameter."""
+        variance: dict[Key, FloatArray] = {}
+        for key, source, effect in self.effects:
+            added = np.diagonal(effect @ self.draws[source][1] @ effect.T)
+            variance[key] = variance.get(key, np.zeros(len(added))) + added
+        return {key: np.sqrt(each) for key, each in variance.items()}
 
     def start(self) -> FloatArray:
         """Derivative of z by the draws before anything starts, (size, n_draws)."""

@@ -1,5 +1,6 @@
 """Linear covariance against the Kalman filter in closed form, and against sampled campaigns."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import casadi as ca
@@ -9,11 +10,11 @@ from campaign_parts import Filter, Judge, scalar_system
 from scipy.stats import norm
 
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.errors import ConfigurationError, StepError
 from terrafix.cosim.campaign.campaign import run_campaign
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Parameter
-from terrafix.cosim.declare.ports import Capabilities, Input, Output
+from terrafix.cosim.declare.ports import Capabilities, Input, MessageInput, MessageOutput, Output
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.lincov import deviations
@@ -119,17 +120,18 @@ def test_what_cannot_be_linearized_is_named():
 
 
 class Given(Component):
-    """What is the same for all: twice the time."""
+    """What is the same for all: y = k t, at 1 Hz."""
 
     capabilities = Capabilities(given=True)
     default_rate = Rate("1")
+    k = Parameter(2.0, unit="m/s", minimum=0.0)
     y = Output(unit="m")
 
     def _initialize_impl(self):
         self.y = 0.0
 
     def _step_impl(self, t, dt):
-        self.y = 2 * t
+        self.y = self.parameter_values["k"] * t
 
 
 class Doubled(SymbolicComponent):
@@ -144,6 +146,81 @@ class Doubled(SymbolicComponent):
         return Model("doubled", inputs={"u": u}, outputs={"y": 2 * u})
 
 
+class Scaled(SymbolicComponent):
+    """y = k t."""
+
+    default_rate = Rate("1")
+    k = Parameter(2.0, unit="m/s")
+    y = Output(unit="m")
+
+    def build_model(self):
+        k, t = ca.SX.sym("k"), ca.SX.sym("t")
+        return Model("scaled", parameters={"k": k}, outputs={"y": k * t}, time=t)
+
+
+class Slow(Component):
+    """Twice what it reads, in Python."""
+
+    capabilities = Capabilities(given=True)
+    default_rate = Rate("1")
+    u = Input(unit="m")
+    y = Output(unit="m")
+
+    def _initialize_impl(self):
+        self.y = 2 * self.u
+
+    def _step_impl(self, t, dt):
+        self.y = 2 * self.u
+
+
+class Failing(Given):
+    """Fails beyond a slope."""
+
+    def _step_impl(self, t, dt):
+        super()._step_impl(t, dt)
+        self.fail((self.parameter_values["k"] > 2.05) & (t == 3), "too steep")
+
+
+class Telling(Given):
+    """Publishes a matrix and a message too."""
+
+    table = Output((2, 2))
+    said = MessageOutput((2,))
+
+    def _initialize_impl(self):
+        super()._initialize_impl()
+        self.table = np.eye(2)
+
+
+class ReadsTable(SymbolicComponent):
+    """Reads the matrix too."""
+
+    default_rate = Rate("1")
+    u = Input(unit="m")
+    table = Input((2, 2))
+    y = Output(unit="m")
+
+    def build_model(self):
+        u, table = ca.SX.sym("u"), ca.SX.sym("table", 2, 2)
+        inputs = {"u": u, "table": table}
+        return Model("reads_table", inputs=inputs, outputs={"y": u + table[0, 0]})
+
+
+class ReadsMessage(SymbolicComponent):
+    """Reads the message too."""
+
+    default_rate = Rate("1")
+    u = Input(unit="m")
+    said = MessageInput((2,))
+    y = Output(unit="m")
+
+    def build_model(self):
+        u, said, fresh = ca.SX.sym("u"), ca.SX.sym("said", 2), ca.SX.sym("fresh")
+        inputs = {"u": u, "said": said, "said.fresh": fresh}
+        outputs = {"y": u + ca.if_else(fresh, said[0], 0.0)}
+        return Model("reads_message", inputs=inputs, outputs=outputs)
+
+
 def test_what_is_given_is_taken_as_it_is():
     """It is no obstacle, and adds nothing to what deviates; what reads it need not know."""
     system, alone = scalar_system(), scalar_system()
@@ -152,11 +229,82 @@ def test_what_is_given_is_taken_as_it_is():
     np.testing.assert_array_equal(linear_covariance(system).total, linear_covariance(alone).total)
 
 
-def test_what_reads_something_is_not_given():
+def test_what_reads_what_noise_reaches_is_not_given():
     system = scalar_system(tripwire=1)
     system.nodes["wire"].capabilities = Capabilities(given=True)
-    with pytest.raises(ConfigurationError, match=r"'wire' \(Tripwire\) has no symbolic Jacobian"):
+    with pytest.raises(ConfigurationError) as raised:
         linear_covariance(system)
+    assert str(raised.value) == (
+        "'wire' (Tripwire) has no symbolic Jacobian, as all that can only be stepped (FMUs, "
+        "components in Python), and its input 'u' reads 'filter.truth', which deviates with the "
+        "noise of 'filter', so the system cannot be linearized\n"
+        "  fly a campaign instead, which takes its dispersions"
+    )
+
+
+def judged(*parts):
+    """The scalar filter, its estimate compared with what the last of some other parts publishes."""
+    system = System("judged", duration=5)
+    part, judge = system.add(Filter(), "filter"), system.add(Judge(), "judge")
+    for port in ("estimate", "variance", "innovation", "innovation_variance"):
+        system.connect(part[port], judge[port])
+    for name, each in parts:
+        system.add(each, name)
+    for (_, before), (_, after) in pairwise(parts):
+        system.connect(before["y"], after["u"])
+    system.connect(parts[-1][1]["y"], judge["truth"])
+    return system
+
+
+@pytest.mark.parametrize(
+    ("parts", "factor"), [([], 1.0), ([("twice", Doubled())], 2.0), ([("slow", Slow())], 2.0)]
+)
+def test_what_is_given_deviates_with_its_dispersed_parameters(parts, factor):
+    """By t sigma, or twice that, behind what is symbolic or can only be stepped."""
+    system = judged(("given", Given()), *parts)
+    assert not [n for n in linear_covariance(system).sources if "dispersion" in n]
+    system.disperse(Dispersion("k", ("given.k",), 0.3))
+    found = linear_covariance(system)
+    expected = factor * 0.3 * found.times
+    sigma = np.sqrt(found.sources["dispersion k"][:, 0, 0])
+    np.testing.assert_allclose(sigma, expected, rtol=1e-12)
+    system.disperse(Dispersion("more", ("given.k",), 0.4))  # of the same parameter
+    found = linear_covariance(system)
+    np.testing.assert_allclose(found.budget()["dispersion k"], 5 * factor * 0.3, rtol=1e-12)
+    np.testing.assert_allclose(found.budget()["dispersion more"], 5 * factor * 0.4, rtol=1e-12)
+
+
+def test_a_dispersed_symbolic_component_reaches_what_can_only_be_stepped():
+    system = judged(("scaled", Scaled()), ("slow", Slow()))
+    system.disperse(Dispersion("k", ("scaled.k",), 0.3))
+    found = linear_covariance(system)
+    sigma = np.sqrt(found.sources["dispersion k"][:, 0, 0])
+    np.testing.assert_allclose(sigma, 2 * 0.3 * found.times, rtol=1e-12)
+
+
+def test_what_nobody_reads_changes_nothing():
+    system, alone = scalar_system(), scalar_system()
+    system.add(Scaled(), "scaled")
+    system.disperse(Dispersion("k", ("scaled.k",), 0.3))
+    np.testing.assert_array_equal(linear_covariance(system).total, linear_covariance(alone).total)
+
+
+def test_dispersions_of_what_can_only_be_stepped_that_cannot_be_linearized():
+    def refused(given, reader=None, port=None):
+        system = judged(("given", given), *([] if reader is None else [("reader", reader)]))
+        if reader is not None:
+            system.connect(given[port], reader[port])
+        system.disperse(Dispersion("k", ("given.k",), 0.4))
+        linear_covariance(system)
+
+    with pytest.raises(ConfigurationError, match=r"'given.k' is -0.1 m/s; (?s:.*) fly a campaign"):
+        refused(Given(k=0.0))
+    with pytest.raises(StepError, match=r"'given' at t = 3 s, in a member .*: too steep\n  fly a"):
+        refused(Failing())
+    with pytest.raises(ConfigurationError, match=r"'given.table' is a matrix of what has no sym"):
+        refused(Telling(), ReadsTable(), "table")
+    with pytest.raises(ConfigurationError, match=r"'given.said' is a message of what has no sym"):
+        refused(Telling(), ReadsMessage(), "said")
 
 
 @pytest.fixture(scope="module")

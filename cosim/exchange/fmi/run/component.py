@@ -216,7 +216,10 @@ class Fmu(Compiled, Telling):
             notes += (
                 f"its inputs {', '.join(clocked)} are set when they change, not by their clocks",
             )
-        self.capabilities = Capabilities(state=found.serialize, notes=notes)  # type: ignore[misc]
+        noisy = found.own and "seed" in found.parameters
+        self.capabilities = Capabilities(  # type: ignore[misc]
+            state=found.serialize, given=not noisy, notes=notes
+        )
 
     def _prepare_fmi1(self) -> None:
         """Refuse what FMI 1.0 has no function for."""

@@ -107,7 +107,8 @@ class FmuLoop(Telling):
                 if not port.is_input or (name, key) not in driven:
                     self._declare(f"{name}_{key}", port)
         serializes = all(p.interface.serialize for p in self._parts.values())
-        self.capabilities = Capabilities(state=serializes)  # type: ignore[misc]
+        given = all(p.capabilities.given for p in self._parts.values())
+        self.capabilities = Capabilities(state=serializes, given=given)  # type: ignore[misc]
 
     def _declare(self, name: str, port: Port[Any]) -> None:
         one = port.single

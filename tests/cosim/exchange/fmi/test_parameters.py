@@ -18,7 +18,6 @@ from terrafix.cosim.exchange.fmi.run.loop import FmuLoop
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.files.writing import write_system
-from terrafix.cosim.lincov.deviations import linear_covariance
 from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.cosim.system.system import System
 
@@ -58,18 +57,6 @@ def values_of(result):
 
 
 # ------------------------------------------------------------------ dispersed
-
-
-def test_linear_covariance_needs_equations_and_says_what_goes_without(exported):
-    system = read_system(OPEN_LOOP)
-    system.replace("orbit", Fmu(file=exported("orbit", 3), rate=Rate("0.01")))
-    with pytest.raises(ConfigurationError) as raised:
-        linear_covariance(system, duration="1")
-    assert str(raised.value) == (
-        "'orbit' (Fmu) has no symbolic Jacobian, as all that can only be stepped (FMUs, components "
-        "in Python), so the system cannot be linearized\n"
-        "  fly a campaign instead, which takes its dispersions"
-    )
 
 
 def dispersed_open_loop(orbit=None):
