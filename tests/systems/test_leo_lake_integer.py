@@ -35,6 +35,7 @@ def test_whole_pixels_in_what_is_measured_make_the_filter_overconfident(integer,
     assert error > 150.0
 
 
+@pytest.mark.campaign
 def test_whole_pixels_on_both_sides_lose_the_satellite(integer, outline):
     """A step of 0.1 km is a third of a pixel: differences see whole pixels or none. Kilometers."""
     system = integer.whole_pixels(

@@ -40,7 +40,7 @@ LENS = [("distortion", "brown"), ("lens", "[-0.2, 0, 0, 0.002, -0.001]")]
     "settings",
     [
         [pair for one in LENS for pair in both(*one)],
-        both("pointing", "geodetic"),
+        pytest.param(both("pointing", "geodetic"), marks=pytest.mark.campaign),
         both("mounting", "[2, -1, 30] deg"),
     ],
 )

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 import terrafix as tf
@@ -20,6 +21,7 @@ def read(outline, *settings, case="T3"):
     return tf.read_system(SHORE, told)
 
 
+@pytest.mark.campaign
 def test_part_of_a_lake_is_found_from_seventy_kilometers_and_the_filter_is_consistent(outline):
     """All of 15 members at once; NEES of three and NIS of six in their 99.9 % intervals."""
     system = read(outline)

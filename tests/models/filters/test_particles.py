@@ -199,6 +199,7 @@ def test_where_all_is_linear_particles_are_the_kalman_filter(linear):
     assert np.sqrt((d**2).mean()) > 0.2 * expected  # it is not the Kalman filter itself
 
 
+@pytest.mark.campaign
 def test_errors_fall_as_the_root_of_the_number_of_particles():
     """From 250 to 4000: by 4, within a factor of 1.8, for means of 50 members with tails."""
     few, many = (np.sqrt((compared((), n, seed=7)[0] ** 2).mean()) for n in (250, 4000))

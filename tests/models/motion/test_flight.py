@@ -69,7 +69,10 @@ def view(flown, earth, start=START):
     return dict(zip(names, see(flown["r_e"], flown["v_e"], flown["q_be"]), strict=True))
 
 
-@pytest.mark.parametrize(("earth", "n"), [("wgs84", 60000), ("flat", 9000)])
+@pytest.mark.parametrize(
+    ("earth", "n"),
+    [pytest.param("wgs84", 60000, marks=pytest.mark.campaign), ("wgs84", 9000), ("flat", 9000)],
+)
 def test_increments_lead_to_the_truth_after_ten_minutes(earth, n):
     """Turns, climbs and turbulence at 100 Hz: to rounding, which may add up to 1e-6 m.
 

@@ -80,19 +80,24 @@ def test_the_filter_over_72_updates_is_the_native_one(exported):
         assert np.array_equal(expected[variable], flown[variable])
 
 
-@pytest.mark.parametrize("fmi", VERSIONS)
+TWO_BODY = (("orbit.gravity", "two-body"),)
+DRAG = (
+    ("orbit.drag", "true"),
+    ("orbit.density", "1e-11 kg/m^3"),
+    ("orbit.ballistic_coefficient", "0.01 m^2/kg"),
+)
+
+
 @pytest.mark.parametrize(
-    "settings",
+    ("fmi", "settings"),
     [
-        (),
-        (("orbit.gravity", "two-body"),),
-        (
-            ("orbit.drag", "true"),
-            ("orbit.density", "1e-11 kg/m^3"),
-            ("orbit.ballistic_coefficient", "0.01 m^2/kg"),
-        ),
+        pytest.param(3, (), id="3-j2"),
+        pytest.param(2, DRAG, id="2-drag"),
+        pytest.param(2, (), id="2-j2", marks=pytest.mark.campaign),
+        pytest.param(3, DRAG, id="3-drag", marks=pytest.mark.campaign),
+        pytest.param(2, TWO_BODY, id="2-two-body", marks=pytest.mark.campaign),
+        pytest.param(3, TWO_BODY, id="3-two-body", marks=pytest.mark.campaign),
     ],
-    ids=["j2", "two-body", "drag"],
 )
 def test_the_orbit_over_6000_s(exported, fmi, settings):
     """Co-simulation: the same bits. Model exchange by CVode: within 0.02 m."""
