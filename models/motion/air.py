@@ -8,12 +8,12 @@ References
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.extras import optional
+from terrafix.models.core.timescales import Instant
 from terrafix.models.geometry.geodesy import geodetic_from_ecef_array
 
 _REACH = 1e3
@@ -46,7 +46,7 @@ def air_about(
     ImportError
         If pymsis is not installed; the message says what to install.
     """
-    msis = _pymsis()
+    msis = optional("pymsis", "a density by MSIS")
     r = np.atleast_2d(np.asarray(r_e, np.float64))
     n = len(r)
     steps = _REACH * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
@@ -67,12 +67,16 @@ def air_about(
     return logs[0], (logs[1:4] - logs[4:]).T / (2 * _REACH)
 
 
-def _pymsis() -> Any:
-    try:
-        import pymsis
-    except ImportError as error:
-        raise ImportError(
-            "a density by MSIS needs the package 'pymsis', which is not installed\n"
-            "  install it: pip install 'terrafix[truth]'"
-        ) from error
-    return pymsis
+def utc_of(instant: Instant) -> np.datetime64:
+    """One instant in UTC, to a nanosecond; within a leap second, the second after it.
+
+    Raises
+    ------
+    ValueError
+        If the table of leap seconds does not reach it.
+    ImportError
+        If that table is not installed.
+    """
+    day, seconds = instant.to("UTC")
+    midnight = np.datetime64("1858-11-17", "ns") + np.timedelta64(day, "D")
+    return np.datetime64(midnight + np.timedelta64(round(seconds * 1e9), "ns"))
