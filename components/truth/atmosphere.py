@@ -12,7 +12,8 @@ from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import BundleOutput, Input
 from terrafix.models.core.timescales import Instant
-from terrafix.models.motion.air import air_about, utc_of
+from terrafix.models.motion.air import air_about
+from terrafix.models.motion.epochs import utc_tag
 
 
 class Atmosphere(Component):
@@ -37,7 +38,7 @@ class Atmosphere(Component):
         """Look whether the date is known, and MSIS installed."""
         self._start = read_epoch(self, epoch)
         try:
-            air_about([7e6, 0, 0], utc_of(self._start), 100.0, 100.0, 4.0)
+            air_about([7e6, 0, 0], utc_tag(self._start), 100.0, 100.0, 4.0)
         except (ImportError, ValueError) as error:
             raise ConfigurationError(f"'{self.name}': {error}") from error
 
@@ -54,7 +55,7 @@ class Atmosphere(Component):
 
     def _publish(self, t: float) -> None:
         assert self._start is not None
-        now = utc_of(self._start.plus(t))
+        now = utc_tag(self._start.plus(t))
         density, gradient = air_about(self.r_e, now, self.f107, self.f107a, self.ap)
         self.air.r_e[:] = self.r_e
         self.air.log_density[:] = density

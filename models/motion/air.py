@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.extras import optional
-from terrafix.models.core.timescales import Instant
 from terrafix.models.geometry.geodesy import geodetic_from_ecef_array
 
 _REACH = 1e3
@@ -65,18 +64,3 @@ def air_about(
     density = np.asarray(found, np.float64)[:, msis.Variable.MASS_DENSITY]
     logs = np.log(density).reshape(7, n)
     return logs[0], (logs[1:4] - logs[4:]).T / (2 * _REACH)
-
-
-def utc_of(instant: Instant) -> np.datetime64:
-    """One instant in UTC, to a nanosecond; within a leap second, the second after it.
-
-    Raises
-    ------
-    ValueError
-        If the table of leap seconds does not reach it.
-    ImportError
-        If that table is not installed.
-    """
-    day, seconds = instant.to("UTC")
-    midnight = np.datetime64("1858-11-17", "ns") + np.timedelta64(day, "D")
-    return np.datetime64(midnight + np.timedelta64(round(seconds * 1e9), "ns"))

@@ -101,6 +101,20 @@ def atomic(tags: NDArray[np.datetime64], within: NDArray[np.bool_], scale: str) 
     return found
 
 
+def utc_tag(instant: Instant) -> np.datetime64:
+    """Tag of one instant in UTC; within a leap second, that of the second after it.
+
+    Raises
+    ------
+    ValueError
+        If the table of leap seconds does not reach it.
+    ImportError
+        If that table is not installed.
+    """
+    day, seconds = instant.to("UTC")
+    return _MJD0 + day * _DAY + np.timedelta64(round(seconds * 1e9), "ns")
+
+
 def seconds_since_first(
     tags: NDArray[np.datetime64], within: NDArray[np.bool_], scale: str
 ) -> FloatArray:
