@@ -7,7 +7,7 @@ import numpy as np
 from terrafix.components.dated import read_epoch
 from terrafix.components.fields import AIR, XYZ
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.errors import ConfigurationError, EpochError
 from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import BundleOutput, Input
@@ -39,7 +39,9 @@ class Atmosphere(Component):
         self._start = read_epoch(self, epoch)
         try:
             air_about([7e6, 0, 0], utc_tag(self._start), 100.0, 100.0, 4.0)
-        except (ImportError, ValueError) as error:
+        except ValueError as error:
+            raise EpochError(f"'{self.name}': {error}") from error
+        except ImportError as error:
             raise ConfigurationError(f"'{self.name}': {error}") from error
 
     def bind(self, environment: Environment) -> None:

@@ -131,9 +131,12 @@ def parse_epoch(text: str) -> Instant:
     scale = "UTC" if scale == "Z" else scale
     try:
         _check_scale(scale)
-        day = int((np.datetime64(date, "D") - np.datetime64("1858-11-17", "D")).astype(int))
     except ValueError as error:
         raise ValueError(f"the epoch '{text}': {error}") from None
+    try:
+        day = int((np.datetime64(date, "D") - np.datetime64("1858-11-17", "D")).astype(int))
+    except ValueError:
+        raise ValueError(f"the epoch '{text}': there is no {date}") from None
     h, m, s = int(hour), int(minute), float(second)
     if h > 23 or m > 59 or s >= 61:
         raise ValueError(f"the epoch '{text}' has no such time of day")
@@ -147,7 +150,10 @@ def parse_epoch(text: str) -> Instant:
                 f"the epoch '{text}' does not exist: there was no leap second\n"
                 f"  the nearest one was {nearest}T23:59:60 UTC"
             )
-    return tai_from(scale, day, 3600.0 * h + 60.0 * m + s)
+    try:
+        return tai_from(scale, day, 3600.0 * h + 60.0 * m + s)
+    except ValueError as error:
+        raise ValueError(f"the epoch '{text}': {error}") from error
 
 
 def tai_from(scale: str, day: ArrayLike, seconds: ArrayLike) -> Instant:

@@ -112,7 +112,8 @@ def utc_tag(instant: Instant) -> np.datetime64:
         If that table is not installed.
     """
     day, seconds = instant.to("UTC")
-    return _MJD0 + day * _DAY + np.timedelta64(round(seconds * 1e9), "ns")
+    found: np.datetime64 = _MJD0 + day * _DAY + np.timedelta64(round(seconds * 1e9), "ns")
+    return found
 
 
 def seconds_since_first(
