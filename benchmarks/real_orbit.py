@@ -7,7 +7,8 @@ Sun, Moon, tide and radiation pressure, against the later states of the file.
 brahe: 24 hours of each force and of all, against brahe (installed with the tests).
 kepler: two bodies for ten days at 100 Hz, against Kepler's equation.
 filter: the open loop on five arcs of that file, with a field of degree 20 in the filter.
-fmu: the 20 x 20 orbit exported, its co-simulation and model exchange against the native one.
+fmu: the 20 x 20 orbit exported, its co-simulation and model exchange against the native one, alone
+and in `examples/satellite.toml`.
 speed: kernels compiled, and 100 members of TC-1 under a true field of 20 x 20, against J2.
 
 The surroundings are computed here, by ERFA from the tables of astropy-iers-data. Some ten minutes.
@@ -48,6 +49,7 @@ from terrafix.models.motion.satellite import Forces, satellite_model
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT.parent / "shared" / "data"))
 NAME = "S1A_OPER_AUX_RESORB_OPOD_20220918T093241_V20220918T053155_20220918T084925.EOF"
+EXAMPLE = ROOT / "examples" / "satellite.toml"
 ORBIT = DATA / "sentinel1" / NAME
 STARTS = (0, 600, 1200, 1800, 2400, 3000, 3600, 4200, 4800, 5400)
 """Of the flights, after the first state of the file [s]."""
@@ -362,6 +364,19 @@ def fmus() -> None:
             f"FMI {fmi}, 20 x 20, made in {made:.1f} s: co-simulation over 600 s "
             f"{'has the same bits' if same else 'DIFFERS'}; model exchange is {apart:.1e} m off"
         )
+        _in_its_world(fmi)
+
+
+def _in_its_world(fmi: int) -> None:
+    """The example with an FMU in place of its satellite: its start, environment and air given."""
+    native, foreign = read_system(EXAMPLE), read_system(EXAMPLE)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "satellite.fmu")
+        export_fmu(native, file, component="satellite", fmi=fmi)
+        foreign.replace("satellite", Fmu(file=file, kind=CO_SIMULATION, rate=Rate("1")))
+        flown = [simulate(system, members=1).dataset for system in (native, foreign)]
+    same = all(x.values.tobytes() == flown[1][n].values.tobytes() for n, x in flown[0].items())
+    print(f"  {EXAMPLE.stem}.toml with it: {'the same bits' if same else 'DIFFERS'}")
 
 
 def _compiled(degree: int) -> None:

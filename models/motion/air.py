@@ -38,7 +38,8 @@ def air_about(
     Returns
     -------
     tuple of ndarray
-        Natural logarithm of the density in kg/m^3, (n,), and its gradient [1/m], (n, 3).
+        Natural logarithm of the density in kg/m^3, (n,), and its gradient [1/m], (n, 3); not finite
+        where MSIS has none.
 
     Raises
     ------
@@ -62,5 +63,6 @@ def air_about(
         np.repeat(seven[2][:, None], 7, axis=1),
     )
     density = np.asarray(found, np.float64)[:, msis.Variable.MASS_DENSITY]
-    logs = np.log(density).reshape(7, n)
-    return logs[0], (logs[1:4] - logs[4:]).T / (2 * _REACH)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(density).reshape(7, n)
+        return logs[0], (logs[1:4] - logs[4:]).T / (2 * _REACH)

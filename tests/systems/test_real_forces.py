@@ -7,7 +7,10 @@ import brahe_reference
 import numpy as np
 import pytest
 
+from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.engine.run import simulate
+from terrafix.cosim.exchange.fmi.run.component import CO_SIMULATION, Fmu
+from terrafix.cosim.exchange.fmi.write.export import export_fmu
 from terrafix.cosim.files.readers import read_system
 from terrafix.models.core.timescales import DAY, parse_epoch
 from terrafix.models.geometry.orientation import earth_orientation
@@ -24,8 +27,8 @@ def in_vacuum():
     return read_system(EXAMPLE, [("satellite.ballistic_coefficient", "0 m^2/kg")])
 
 
-def flown(system):
-    found = simulate(system, members=1).dataset
+def flown(system, **given):
+    found = simulate(system, members=1, **given).dataset
     return {n: found[f"satellite.{n}"].values[-1, 0] for n in ("r_i", "v_i", "r_e", "v_e")}
 
 
@@ -107,3 +110,17 @@ def test_the_air_holds_it_back():
     radial = 2 * push / n**2 * (n * t - np.sin(n * t))
     along = push * (4 / n**2 * (1 - np.cos(n * t)) - 1.5 * t**2)
     assert apart == pytest.approx(np.hypot(radial, along), rel=0.1)
+
+
+def test_as_an_fmu_it_flies_the_same_bits(tmp_path):
+    """In place of the component, with its start, environment and air connected as before.
+
+    FMI 2 and 20 x 20 over ten minutes: `benchmarks/real_orbit.py`.
+    """
+    file, settings = tmp_path / "satellite.fmu", [("satellite.degree", "4")]
+    export_fmu(read_system(EXAMPLE, settings), file, component="satellite", fmi=3)
+    native, foreign = (read_system(EXAMPLE, settings) for _ in range(2))
+    foreign.replace("satellite", Fmu(file=file, kind=CO_SIMULATION, rate=Rate("1")))
+    ends = [flown(system, duration="25") for system in (native, foreign)]
+    for name, value in ends[0].items():
+        assert ends[1][name].tobytes() == value.tobytes(), name
