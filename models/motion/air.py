@@ -51,18 +51,21 @@ def air_about(
     n = len(r)
     steps = _REACH * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
     places = (r[None] + steps[:, None]).reshape(-1, 3)
-    latitude, longitude, height = geodetic_from_ecef_array(places)
     seven = [np.tile(np.broadcast_to(np.asarray(x, np.float64), n), 7) for x in (f107, f107a, ap)]
-    found = msis.calculate(
-        np.full(7 * n, utc),
-        np.degrees(longitude),
-        np.degrees(latitude),
-        height / 1e3,
-        seven[0],
-        seven[1],
-        np.repeat(seven[2][:, None], 7, axis=1),
-    )
-    density = np.asarray(found, np.float64)[:, msis.Variable.MASS_DENSITY]
+    density = np.full(7 * n, np.nan)
+    known = np.isfinite(places).all(axis=1)
+    if known.any():
+        latitude, longitude, height = geodetic_from_ecef_array(places[known])
+        found = msis.calculate(
+            np.full(known.sum(), utc),
+            np.degrees(longitude),
+            np.degrees(latitude),
+            height / 1e3,
+            seven[0][known],
+            seven[1][known],
+            np.repeat(seven[2][known, None], 7, axis=1),
+        )
+        density[known] = np.asarray(found, np.float64)[:, msis.Variable.MASS_DENSITY]
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(density).reshape(7, n)
         return logs[0], (logs[1:4] - logs[4:]).T / (2 * _REACH)

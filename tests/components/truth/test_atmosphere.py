@@ -94,6 +94,14 @@ def test_the_date_is_that_of_the_system():
         simulate(falling(None))
 
 
+def test_a_place_that_is_none_has_no_air_and_leaves_the_others_theirs():
+    logs, gradients = air_about([[np.nan] * 3, R_E], EPOCH, 140.0, 130.0, 12.0)
+    alone = air_about(R_E, EPOCH, 140.0, 130.0, 12.0)
+    assert np.isnan(logs[0])
+    np.testing.assert_array_equal(logs[1], alone[0][0])
+    np.testing.assert_array_equal(gradients[1], alone[1][0])
+
+
 def test_there_is_no_density_without_indices():
     system = System("bare", duration="1 s", epoch="2022-09-18T07:49:21 UTC")
     system.add(Atmosphere(f107=140.0, f107a=130.0), "air")
