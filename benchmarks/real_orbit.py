@@ -11,7 +11,7 @@ fmu: the 20 x 20 orbit exported, its co-simulation and model exchange against th
 and in `examples/satellite.toml`.
 speed: kernels compiled, and 100 members of TC-1 under a true field of 20 x 20, against J2.
 
-The surroundings are computed here, by ERFA from the tables of astropy-iers-data. Some ten minutes.
+The surroundings are those of type `environment` (`terrafix[truth]`). Some ten minutes.
 """
 
 from __future__ import annotations
@@ -26,8 +26,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import astropy_iers_data
-import erfa
 import numpy as np
 
 from terrafix.components.truth.satellite_orbit import SatelliteOrbit
@@ -38,9 +36,10 @@ from terrafix.cosim.exchange.fmi.run.component import CO_SIMULATION, MODEL_EXCHA
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
+from terrafix.models.core.timescales import parse_epoch
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import earth_fixed_from_inertial_array
-from terrafix.models.geometry.quaternion import from_matrix_array
+from terrafix.models.motion.bodies import environment_at
 from terrafix.models.motion.ephemeris import read_eof
 from terrafix.models.motion.gravity_field import SHIPPED, shipped_field
 from terrafix.models.motion.kepler import KeplerianElements, circular_orbit
@@ -61,51 +60,17 @@ SENTINEL = 1.3 * 25.0 / 2157.0
 """Coefficient of radiation pressure times area over mass of Sentinel-1A, roughly [m^2/kg]."""
 PERIOD = 10.0
 """Of the surroundings [s]."""
-LEAPS = 37.0  # [s], TAI less UTC since 2017
 ARC_SECOND = np.radians(1 / 3600)
-COLUMNS = ((7, 15), (18, 27), (37, 46), (58, 68), (97, 106), (116, 125))
 Sky = Callable[[float], dict[str, Any]]
 
 
 def surroundings(utc: np.datetime64) -> Sky:
     """What surrounds a satellite, as a function of the seconds since an epoch."""
-    with Path(astropy_iers_data.IERS_A_FILE).open() as lines:
-        rows = [[line[a:b] for a, b in COLUMNS] for line in lines if line[97:106].strip()]
-    table = np.array(rows, dtype=float).T
-    since = (utc - np.datetime64("1858-11-17T00:00:00", "ns")) / np.timedelta64(1, "s")
-    day, second = divmod(float(since), 86400.0)
-
-    def turned(t: float) -> Any:
-        x_p, y_p, dut, dx, dy = (
-            np.interp(day + (second + t) / 86400, table[0], row) for row in table[1:]
-        )
-        tt = 2400000.5 + day, (second + t + LEAPS + 32.184) / 86400
-        x, y, s = erfa.xys06a(*tt)
-        pole = erfa.c2ixys(x + dx * ARC_SECOND / 1e3, y + dy * ARC_SECOND / 1e3, s)
-        angle = erfa.era00(2400000.5 + day, (second + t + dut) / 86400)
-        motion = erfa.pom00(x_p * ARC_SECOND, y_p * ARC_SECOND, erfa.sp00(*tt))
-        return erfa.c2tcio(pole, angle, motion), tt
+    start = parse_epoch(f"{utc} UTC")
 
     @cache
     def at(t: float) -> dict[str, Any]:
-        (C, tt), h = turned(t), 30.0
-        turn = turned(t + h)[0] @ turned(t - h)[0].T
-        twice = np.array(
-            [turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2], turn[0, 1] - turn[1, 0]]
-        )
-        sine = np.linalg.norm(twice) / 2
-        heliocentric, _ = erfa.epv00(*tt)
-        moon = erfa.moon98(*tt)
-        au = 149597870700.0
-        return {
-            "time": np.array(t),
-            "omega_e": twice / (2 * sine) * np.arcsin(sine) / (2 * h),
-            "q_ei": from_matrix_array(C),
-            "sun_e": -C @ heliocentric["p"] * au,
-            "sun_rate_e": -C @ heliocentric["v"] * au / 86400,
-            "moon_e": C @ moon["p"] * au,
-            "moon_rate_e": C @ moon["v"] * au / 86400,
-        }
+        return {"time": np.array(t), **environment_at(start.plus(t))}
 
     return at
 
@@ -140,9 +105,9 @@ def fly(
 
 def real() -> None:
     orbit = read_eof(ORBIT)
-    at = surroundings(orbit.utc[0])
+    at = surroundings(orbit.tags[0])
     forces = Forces(shipped_field(), sun=True, moon=True, tide=True, radiation=True)
-    print(f"Sentinel-1A from {orbit.utc[0]} UTC, {shipped_field()}, Sun, Moon, tide, radiation")
+    print(f"Sentinel-1A from {orbit.tags[0]} UTC, {shipped_field()}, Sun, Moon, tide, radiation")
     print("distance to the file's later states [m]; brahe's with the same forces, and with step 2")
     print("of the tide, the pole tide, relativity and drag (Harris-Priester, 6 m^2) besides")
     columns = ("start [s]", "10 min", "100 min", "brahe 10 min", "100 min", "more 100 min")
@@ -156,7 +121,7 @@ def real() -> None:
         wanted = [orbit.r_e[k + int(mark) // 10] for mark in marks]
         apart = [np.linalg.norm(flown[m][0] - r) for m, r in zip(marks, wanted, strict=True)]
         for more in (False, True):
-            theirs = _by_brahe(np.concatenate(state), orbit.utc[k], marks, more)
+            theirs = _by_brahe(np.concatenate(state), orbit.tags[k], marks, more)
             apart += [np.linalg.norm(x - r) for x, r in zip(theirs, wanted, strict=True)]
         shown = [apart[i] for i in (0, 1, 2, 3, 5)]
         print(f"{start:12d} " + " ".join(f"{x:12.3f}" for x in shown), flush=True)
