@@ -7,10 +7,11 @@ Sun, Moon, tide and radiation pressure, against the later states of the file.
 brahe: 24 hours of each force and of all, against brahe (installed with the tests).
 kepler: two bodies for ten days at 100 Hz, against Kepler's equation.
 filter: the open loop on five arcs of that file, with a field of degree 20 in the filter.
-fmu: the 20 x 20 orbit exported, its co-simulation and model exchange against the native one.
+fmu: the 20 x 20 orbit exported, its co-simulation and model exchange against the native one, alone
+and in `examples/satellite.toml`.
 speed: kernels compiled, and 100 members of TC-1 under a true field of 20 x 20, against J2.
 
-The surroundings are computed here, by ERFA from the tables of astropy-iers-data. Some ten minutes.
+The surroundings are those of type `environment` (`terrafix[truth]`). Some ten minutes.
 """
 
 from __future__ import annotations
@@ -25,8 +26,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import astropy_iers_data
-import erfa
 import numpy as np
 
 from terrafix.components.truth.satellite_orbit import SatelliteOrbit
@@ -37,9 +36,10 @@ from terrafix.cosim.exchange.fmi.run.component import CO_SIMULATION, MODEL_EXCHA
 from terrafix.cosim.exchange.fmi.write.export import export_fmu
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.system import System
+from terrafix.models.core.timescales import parse_epoch
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import earth_fixed_from_inertial_array
-from terrafix.models.geometry.quaternion import from_matrix_array
+from terrafix.models.motion.bodies import environment_at
 from terrafix.models.motion.ephemeris import read_eof
 from terrafix.models.motion.gravity_field import SHIPPED, shipped_field
 from terrafix.models.motion.kepler import KeplerianElements, circular_orbit
@@ -48,6 +48,7 @@ from terrafix.models.motion.satellite import Forces, satellite_model
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT.parent / "shared" / "data"))
 NAME = "S1A_OPER_AUX_RESORB_OPOD_20220918T093241_V20220918T053155_20220918T084925.EOF"
+EXAMPLE = ROOT / "examples" / "satellite.toml"
 ORBIT = DATA / "sentinel1" / NAME
 STARTS = (0, 600, 1200, 1800, 2400, 3000, 3600, 4200, 4800, 5400)
 """Of the flights, after the first state of the file [s]."""
@@ -59,51 +60,17 @@ SENTINEL = 1.3 * 25.0 / 2157.0
 """Coefficient of radiation pressure times area over mass of Sentinel-1A, roughly [m^2/kg]."""
 PERIOD = 10.0
 """Of the surroundings [s]."""
-LEAPS = 37.0  # [s], TAI less UTC since 2017
 ARC_SECOND = np.radians(1 / 3600)
-COLUMNS = ((7, 15), (18, 27), (37, 46), (58, 68), (97, 106), (116, 125))
 Sky = Callable[[float], dict[str, Any]]
 
 
 def surroundings(utc: np.datetime64) -> Sky:
     """What surrounds a satellite, as a function of the seconds since an epoch."""
-    with Path(astropy_iers_data.IERS_A_FILE).open() as lines:
-        rows = [[line[a:b] for a, b in COLUMNS] for line in lines if line[97:106].strip()]
-    table = np.array(rows, dtype=float).T
-    since = (utc - np.datetime64("1858-11-17T00:00:00", "ns")) / np.timedelta64(1, "s")
-    day, second = divmod(float(since), 86400.0)
-
-    def turned(t: float) -> Any:
-        x_p, y_p, dut, dx, dy = (
-            np.interp(day + (second + t) / 86400, table[0], row) for row in table[1:]
-        )
-        tt = 2400000.5 + day, (second + t + LEAPS + 32.184) / 86400
-        x, y, s = erfa.xys06a(*tt)
-        pole = erfa.c2ixys(x + dx * ARC_SECOND / 1e3, y + dy * ARC_SECOND / 1e3, s)
-        angle = erfa.era00(2400000.5 + day, (second + t + dut) / 86400)
-        motion = erfa.pom00(x_p * ARC_SECOND, y_p * ARC_SECOND, erfa.sp00(*tt))
-        return erfa.c2tcio(pole, angle, motion), tt
+    start = parse_epoch(f"{utc} UTC")
 
     @cache
     def at(t: float) -> dict[str, Any]:
-        (C, tt), h = turned(t), 30.0
-        turn = turned(t + h)[0] @ turned(t - h)[0].T
-        twice = np.array(
-            [turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2], turn[0, 1] - turn[1, 0]]
-        )
-        sine = np.linalg.norm(twice) / 2
-        heliocentric, _ = erfa.epv00(*tt)
-        moon = erfa.moon98(*tt)
-        au = 149597870700.0
-        return {
-            "time": np.array(t),
-            "omega_e": twice / (2 * sine) * np.arcsin(sine) / (2 * h),
-            "q_ei": from_matrix_array(C),
-            "sun_e": -C @ heliocentric["p"] * au,
-            "sun_rate_e": -C @ heliocentric["v"] * au / 86400,
-            "moon_e": C @ moon["p"] * au,
-            "moon_rate_e": C @ moon["v"] * au / 86400,
-        }
+        return {"time": np.array(t), **environment_at(start.plus(t))}
 
     return at
 
@@ -362,6 +329,19 @@ def fmus() -> None:
             f"FMI {fmi}, 20 x 20, made in {made:.1f} s: co-simulation over 600 s "
             f"{'has the same bits' if same else 'DIFFERS'}; model exchange is {apart:.1e} m off"
         )
+        _in_its_world(fmi)
+
+
+def _in_its_world(fmi: int) -> None:
+    """The example with an FMU in place of its satellite: its start, environment and air given."""
+    native, foreign = read_system(EXAMPLE), read_system(EXAMPLE)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "satellite.fmu")
+        export_fmu(native, file, component="satellite", fmi=fmi)
+        foreign.replace("satellite", Fmu(file=file, kind=CO_SIMULATION, rate=Rate("1")))
+        flown = [simulate(system, members=1).dataset for system in (native, foreign)]
+    same = all(x.values.tobytes() == flown[1][n].values.tobytes() for n, x in flown[0].items())
+    print(f"  {EXAMPLE.stem}.toml with it: {'the same bits' if same else 'DIFFERS'}")
 
 
 def _compiled(degree: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.errors import EpochError
 from terrafix.cosim.declare.component import Component
 from terrafix.models.core.timescales import Instant, parse_epoch
 
@@ -12,15 +12,15 @@ def read_epoch(component: Component, epoch: str | None) -> Instant:
 
     Raises
     ------
-    ConfigurationError
+    EpochError
         If there is no epoch, or it cannot be read.
     """
     if epoch is None:
-        raise ConfigurationError(
+        raise EpochError(
             f"'{component.name}' needs to know what time it is, and the system has no epoch\n"
             '  give it one, at the top of its file: epoch = "2022-09-18T07:49:21.5 UTC"'
         )
     try:
         return parse_epoch(epoch)
     except (ImportError, ValueError) as error:
-        raise ConfigurationError(f"'{component.name}' cannot use the epoch: {error}") from error
+        raise EpochError(str(error)) from error

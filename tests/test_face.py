@@ -13,7 +13,8 @@ from terrafix.cosim.declare.registry import component_entries
 FACE = [
     *("BundleInput", "BundleOutput", "CampaignError", "CampaignResult", "Capabilities"),
     *("CheckpointError", "Choice", "Component", "ConfigurationError", "Count", "Dispersion"),
-    *("Evaluation", "Field", "FilePath", "FileTable", "Flag", "Input", "LinearCovariance"),
+    *("EpochError", "Evaluation", "Field", "FilePath", "FileTable", "Flag", "Input"),
+    *("LinearCovariance",),
     *("MessageInput", "MessageOutput", "Model", "OptionalFilePath", "Output", "Parameter"),
     *("Quantity", "Rate", "RateError", "Result", "RunError", "STATISTICS", "SharedInput"),
     *(

@@ -104,7 +104,7 @@ class SurroundedMekfPredict(MekfPredict):
     gravity = Choice(("harmonics",), "harmonics", doc="gravity field of the filter")
     tide = Flag(True, doc="tide of the solid Earth besides Sun and Moon")
 
-    surroundings = BundleInput(ENVIRONMENT, doc="rotation of the Earth, Sun and Moon")
+    surroundings = BundleInput(ENVIRONMENT, doc="rotation, Sun and Moon of an environment")
 
     def _field(self) -> Forces:
         field = chosen_field(self.gravity_file, self.degree)

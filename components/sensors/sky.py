@@ -72,7 +72,7 @@ class StarTracker(_Boresighted):
 
     r_e = Input((3,), unit="m", frame="e", doc="true position")
     q_be = Input((4,), unit="1", frame="b", doc="true attitude, Earth-fixed to body")
-    surroundings = BundleInput(ENVIRONMENT, doc="inertial axes, Sun and Moon")
+    surroundings = BundleInput(ENVIRONMENT, doc="inertial axes, Sun and Moon of an environment")
     fix = MessageOutput(fields=STAR_FIX, doc="attitude")
     blocked = Output((), unit="1", doc=f"why nothing is measured: {', '.join(BLOCKED)} (0 to 4)")
 
@@ -121,7 +121,7 @@ class SunSensor(_Direction):
     """Sun sensor: the direction to the Sun, in its field and out of the Earth's shadow."""
 
     boresight_b = _boresight(0.0, 0.0, -1.0)
-    surroundings = BundleInput(ENVIRONMENT, doc="inertial axes, Sun and Moon")
+    surroundings = BundleInput(ENVIRONMENT, doc="inertial axes, Sun and Moon of an environment")
     fix = MessageOutput(fields=DIRECTION_FIX, doc="direction to the Sun")
     lit = Output((), unit="1", doc="1 where the Earth does not hide the Sun")
 

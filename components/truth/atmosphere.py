@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from terrafix.components.dated import read_epoch
 from terrafix.components.fields import AIR, XYZ
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.parameters import Parameter, Text
+from terrafix.cosim.basics.errors import ConfigurationError, EpochError
+from terrafix.cosim.declare.component import Component, Environment
+from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import BundleOutput, Input
+from terrafix.models.core.timescales import Instant
 from terrafix.models.motion.air import air_about
+from terrafix.models.motion.epochs import utc_tag
 
 
 class Atmosphere(Component):
@@ -24,7 +25,6 @@ class Atmosphere(Component):
 
     default_rate = Rate("10")
 
-    epoch = Text(doc='UTC at t = 0: "2022-09-18T07:49:21 UTC"')
     f107 = Parameter(positive=True, doc="solar flux at 10.7 cm of the day before [1e-22 W/m^2/Hz]")
     f107a = Parameter(positive=True, doc="its mean over 81 days [1e-22 W/m^2/Hz]")
     ap = Parameter(minimum=0.0, doc="daily index of geomagnetic activity")
@@ -32,28 +32,22 @@ class Atmosphere(Component):
     r_e = Input((3,), unit="m", frame="e", labels=XYZ, doc="position")
     air = BundleOutput(AIR, doc="density about it")
 
-    def validate(self) -> None:
-        """Read the epoch, and look whether MSIS is installed."""
-        self._start()
+    _start: Instant | None = None
+
+    def validate_epoch(self, epoch: str | None) -> None:
+        """Look whether the date is known, and MSIS installed."""
+        self._start = read_epoch(self, epoch)
         try:
-            air_about([7e6, 0, 0], self._start(), 100.0, 100.0, 4.0)
+            air_about([7e6, 0, 0], utc_tag(self._start), 100.0, 100.0, 4.0)
+        except ValueError as error:
+            raise EpochError(f"'{self.name}': {error}") from error
         except ImportError as error:
             raise ConfigurationError(f"'{self.name}': {error}") from error
 
-    def _start(self) -> np.datetime64:
-        text = str(self.setting("epoch"))
-        words = text.split()
-        start: np.datetime64[Any]
-        try:
-            start = np.datetime64(words[0].removesuffix("Z"), "ns")
-        except (ValueError, IndexError):
-            start = np.datetime64("NaT", "ns")
-        if np.isnat(start) or words[1:] not in ([], ["UTC"]):
-            raise ConfigurationError(
-                f"'{self.name}.epoch' is '{text}', which is no date in UTC\n"
-                '  write it as "2022-09-18T07:49:21 UTC"'
-            )
-        return start
+    def bind(self, environment: Environment) -> None:
+        """Read the epoch."""
+        super().bind(environment)
+        self._start = read_epoch(self, environment.epoch)
 
     def _initialize_impl(self) -> None:
         self._publish(0.0)
@@ -62,7 +56,8 @@ class Atmosphere(Component):
         self._publish(t)
 
     def _publish(self, t: float) -> None:
-        now = self._start() + np.timedelta64(round(t * 1e9), "ns")
+        assert self._start is not None
+        now = utc_tag(self._start.plus(t))
         density, gradient = air_about(self.r_e, now, self.f107, self.f107a, self.ap)
         self.air.r_e[:] = self.r_e
         self.air.log_density[:] = density

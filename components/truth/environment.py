@@ -7,7 +7,7 @@ from typing import ClassVar
 from terrafix.components.dated import read_epoch
 from terrafix.components.fields import ENVIRONMENT
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.errors import EpochError
 from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.ports import BundleOutput, Capabilities
 from terrafix.models.core.timescales import Instant
@@ -46,7 +46,7 @@ class SpaceEnvironment(Component):
         try:
             environment_at(instant)
         except (ImportError, ValueError) as error:
-            raise ConfigurationError(
+            raise EpochError(
                 f"'{self.name}' does not know the world of the run: {error}"
             ) from error
 

@@ -10,7 +10,7 @@ from terrafix.components.dated import read_epoch
 from terrafix.components.fields import START, XYZ
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.basics.errors import ConfigurationError, EpochError
 from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.parameters import Choice, Parameter, Text
 from terrafix.cosim.declare.ports import Capabilities, MessageOutput, Output
@@ -127,9 +127,11 @@ class OrbitStart(Component):
         kind, frame = self.setting("kind"), self.setting("frame")
         stated = kind in ("cartesian", "keplerian")
         if epoch is None and (kind == "tle" or (stated and frame in DATED)):
-            what = "two-line elements" if kind == "tle" else f"a state in the frame '{frame}'"
-            raise ConfigurationError(
-                f"'{self.name}' has {what}, which say nothing about the Earth without a date\n"
+            what, says = f"a state in the frame '{frame}'", "says"
+            if kind == "tle":
+                what, says = "two-line elements", "say"
+            raise EpochError(
+                f"'{self.name}' has {what}, which {says} nothing about the Earth without a date\n"
                 '  give the system its epoch: epoch = "2022-09-18T07:49:21.5 UTC"'
             )
         if epoch is not None and stated and frame == "uniform":
@@ -164,7 +166,7 @@ class OrbitStart(Component):
         try:
             r_e, _ = self._earth_fixed(nominal)
         except (ImportError, ValueError) as error:
-            raise ConfigurationError(f"'{self.name}' cannot start: {error}") from error
+            raise EpochError(f"'{self.name}' cannot start: {error}") from error
         if below_surface(r_e[0], EARTH.radius):
             raise ConfigurationError(
                 f"'{self.name}' starts inside the Earth: {np.linalg.norm(r_e):.6g} m from its "

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafix.components.dated import read_epoch
 from terrafix.components.truth.attitude import LvlhAttitude
 from terrafix.components.truth.orbit import OrbitTruth
 from terrafix.cosim.basics.arrays import FloatArray
@@ -22,7 +23,7 @@ from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, nearest
 from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.parameters import FilePath, Parameter, Text
-from terrafix.models.core.timescales import parse_epoch
+from terrafix.models.core.timescales import Instant, parse_epoch
 from terrafix.models.geometry.celestial import Turning
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import inertial_from_earth_fixed_array
@@ -124,8 +125,8 @@ class Recording:
                     "  fly shorter (--duration), or record the original longer"
                 )
 
-    def since_start(self, epoch: str) -> float:
-        """Seconds from the start of the recording to an epoch.
+    def since_start(self, instant: Instant) -> float:
+        """Seconds from the start of the recording to an instant.
 
         Raises
         ------
@@ -134,7 +135,7 @@ class Recording:
         """
         if not self.epoch:
             raise ValueError(f"'{self.path.name}' was recorded without an epoch")
-        return float(parse_epoch(epoch).minus(parse_epoch(self.epoch)))
+        return float(instant.minus(parse_epoch(self.epoch)))
 
     def choose(self, members: NDArray[np.int64]) -> None:
         """Keep the members that are flown; the only one of a recording serves all."""
@@ -292,10 +293,11 @@ class RecordedOrbit(Component):
                 f"'{self.name}.start' is {start:g} s, but the run begins at the system's epoch, "
                 f"{epoch}\n  leave one of them"
             )
+        now = read_epoch(self, epoch)
         try:
             if isinstance(orbit, Recording):
-                return orbit.since_start(epoch)
-            return orbit.since_first(parse_epoch(epoch))
+                return orbit.since_start(now)
+            return orbit.since_first(now)
         except (ValueError, ImportError) as error:
             raise ConfigurationError(f"'{self.name}' cannot be at {epoch}: {error}") from error
 

@@ -87,8 +87,8 @@ class SatelliteOrbit(SymbolicComponent):
     scale_height = Parameter(90e3, unit="m", positive=True, doc="in which air thins by e")
 
     start = MessageInput(fields=START, needed_at_start=True, doc="where it is at t = 0")
-    surroundings = BundleInput(ENVIRONMENT, doc="rotation of the Earth, Sun and Moon")
-    atmosphere = BundleInput(AIR, at="start", doc="density of the air")
+    surroundings = BundleInput(ENVIRONMENT, doc="rotation, Sun and Moon of an environment")
+    atmosphere = BundleInput(AIR, at="start", doc="density of an atmosphere")
 
     r_i = OrbitTruth.r_i
     v_i = OrbitTruth.v_i

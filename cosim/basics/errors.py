@@ -55,6 +55,10 @@ class ComponentError(StepError):
         return type(self), (self.component, self.tick, self.t_s, self.reason)
 
 
+class EpochError(ConfigurationError):
+    """An epoch that is missing, or that cannot be used: said once for all who ask for it."""
+
+
 class SystemCheckError(TerrafixError):
     """Every problem found in one system, reported together.
 

@@ -378,7 +378,10 @@ class Component(Shown):
         """Raise ConfigurationError if it cannot serve a run of `duration` [s] (a recording)."""
 
     def validate_epoch(self, epoch: str | None) -> None:
-        """Raise ConfigurationError if it cannot serve a system of an `epoch`, or of none."""
+        """Raise ConfigurationError if it cannot serve a system of an `epoch`, or of none.
+
+        An EpochError, where the epoch itself is missing or wrong, is told once for all components.
+        """
 
     @classmethod
     def asks_for_epoch(cls) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 
 from terrafix.cosim.basics.errors import (
     ConfigurationError,
+    EpochError,
     SystemCheckError,
     TerrafixError,
     WiringError,
@@ -126,6 +127,9 @@ class Load:
             return True
         if any(str(problem).startswith(f"'{name}' has no rate") for name in self.broken):
             return True  # its file may have brought one
+        dated = any(isinstance(p, EpochError) for p in self.problems)
+        if dated and isinstance(problem, EpochError):
+            return True  # it has none now
         match = _UNCONNECTED.match(str(problem))
         return match is not None and (
             self.unread or any(_meant(system, a, b, match[1]) for a, b in self.refused)

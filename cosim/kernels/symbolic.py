@@ -129,9 +129,8 @@ class SymbolicComponent(Component):
             try:
                 self._model = (structure, self.build_model())
             except ValueError as error:
-                raise ConfigurationError(
-                    f"{type(self).__name__} cannot build its model: {error}"
-                ) from error
+                who = f"'{self.name}'" if self.name else type(self).__name__
+                raise ConfigurationError(f"{who} cannot build its model: {error}") from error
         return self._model[1]
 
     _model: tuple[Any, SymbolicModel] | None = None

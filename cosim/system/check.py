@@ -13,6 +13,7 @@ import numpy as np
 from terrafix.cosim.basics.clock import Rate, base_step, text_seconds
 from terrafix.cosim.basics.errors import (
     ConfigurationError,
+    EpochError,
     RateError,
     SystemCheckError,
     TerrafixError,
@@ -129,7 +130,7 @@ def check(system: Flattened, *, duration: Fraction | None = None, outside: bool 
 
     attempt(find_order)
     if problems:
-        raise SystemCheckError(system.name, problems)
+        raise SystemCheckError(system.name, _once(problems))
     start = starting_order(flat, order)
     notes = [*system.notes, *_notes(flat), *_starting_notes(start)]
     return Plan(flat, order, base, grid, notes, start, system.epoch)
@@ -166,6 +167,14 @@ def _component_problems(
             yield error
 
 
+def _once(problems: list[TerrafixError]) -> list[TerrafixError]:
+    """Of what is said twice, and of the epoch, the first."""
+    kept: dict[str, TerrafixError] = {}
+    for problem in problems:
+        kept.setdefault("epoch" if isinstance(problem, EpochError) else str(problem), problem)
+    return list(kept.values())
+
+
 def _idle_epoch(flat: FlatSystem, epoch: str | None) -> Iterator[TerrafixError]:
     if epoch is None or not flat.components:
         return
@@ -192,6 +201,7 @@ def _unconnected(flat: FlatSystem, exposed: set[str]) -> Iterator[TerrafixError]
                 f"outputs of the same shape, unit and frame: {', '.join(fits)}"
                 if fits
                 else "no output of the system has its shape, unit and frame"
+                + (f": it takes {port.doc}" if port.is_bundle and port.doc else "")
             )
             yield WiringError(
                 f"input '{path}.{name}' is not connected and has no default\n  {hint}"

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Self, TypeAlias, TypeVar, overload
 from terrafix.cosim.basics.clock import Exact, Rate, seconds
 from terrafix.cosim.basics.errors import (
     ConfigurationError,
+    EpochError,
     RateError,
     SystemCheckError,
     WiringError,
@@ -525,9 +526,9 @@ def _checked_name(name: str, what: str) -> str:
 
 
 def checked_epoch(value: object) -> str:
-    """Accept the text of an epoch, whatever it says; ConfigurationError if it is none."""
+    """Accept the text of an epoch, whatever it says; EpochError if it is none."""
     if not isinstance(value, str) or not value.strip():
-        raise ConfigurationError(
+        raise EpochError(
             f"the epoch is {shown(value)}; it takes text with date, time and time scale\n"
             '  write epoch = "2022-09-18T07:49:21.5 UTC"'
         )

@@ -25,13 +25,16 @@ IntArray = NDArray[np.int64]
 UPDATE = "newer tables come with: pip install -U astropy-iers-data"
 """What to do where a table ends too early."""
 
+MJD_ZERO = np.datetime64("1858-11-17", "D")
+"""Day 0 of modified Julian days."""
+
 _FIRST_DAY = datetime(1858, 11, 17, tzinfo=UTC)
 _ARC_SECOND = np.pi / (180 * 3600)
 
 
 def date_of(day: int | np.integer[Any]) -> str:
     """Calendar date of a modified Julian day, "2022-09-18"."""
-    return str(np.datetime64("1858-11-17") + np.timedelta64(int(day), "D"))
+    return str(MJD_ZERO + np.timedelta64(int(day), "D"))
 
 
 @dataclass(frozen=True)

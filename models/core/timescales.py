@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.iers import (
+    MJD_ZERO,
     UPDATE,
     IntArray,
     date_of,
@@ -98,7 +99,7 @@ class Instant:
         """Write one instant as `parse_epoch` reads it, to `digits` decimals of a second."""
         unit = 10**digits
         day, seconds = self.to(scale)
-        length = int(DAY) + (int(_leap(np.asarray(day))) if scale == "UTC" else 0)
+        length = int(DAY) + (int(leap_at_end(np.asarray(day))) if scale == "UTC" else 0)
         whole, part = divmod(round(seconds * unit), unit)
         if whole >= length:
             day, whole = day + 1, 0
@@ -131,23 +132,29 @@ def parse_epoch(text: str) -> Instant:
     scale = "UTC" if scale == "Z" else scale
     try:
         _check_scale(scale)
-        day = int((np.datetime64(date, "D") - np.datetime64("1858-11-17", "D")).astype(int))
     except ValueError as error:
         raise ValueError(f"the epoch '{text}': {error}") from None
+    try:
+        day = int((np.datetime64(date, "D") - MJD_ZERO).astype(int))
+    except ValueError:
+        raise ValueError(f"the epoch '{text}': there is no {date}") from None
     h, m, s = int(hour), int(minute), float(second)
     if h > 23 or m > 59 or s >= 61:
         raise ValueError(f"the epoch '{text}' has no such time of day")
     if s >= 60:
         if scale != "UTC":
             raise ValueError(f"the epoch '{text}' has a second 60, which {scale} never has")
-        if (h, m) != (23, 59) or not _leap(np.asarray(day)):
+        if (h, m) != (23, 59) or not leap_at_end(np.asarray(day)):
             listed = leap_seconds().day[1:] - 1
             nearest = date_of(listed[np.argmin(np.abs(listed - day))])
             raise ValueError(
                 f"the epoch '{text}' does not exist: there was no leap second\n"
                 f"  the nearest one was {nearest}T23:59:60 UTC"
             )
-    return tai_from(scale, day, 3600.0 * h + 60.0 * m + s)
+    try:
+        return tai_from(scale, day, 3600.0 * h + 60.0 * m + s)
+    except ValueError as error:
+        raise ValueError(f"the epoch '{text}': {error}") from error
 
 
 def tai_from(scale: str, day: ArrayLike, seconds: ArrayLike) -> Instant:
@@ -228,11 +235,11 @@ def _midnights() -> FloatArray:
 
 def table_days(k: IntArray) -> FloatArray:
     """Length of the days of rows of the table of Earth orientation [s], leap seconds included."""
-    return DAY + _leap(orientation_table().day[k])
+    return DAY + leap_at_end(orientation_table().day[k])
 
 
-def _leap(day: IntArray) -> FloatArray:
-    """Leap seconds at the end of days (UTC)."""
+def leap_at_end(day: IntArray) -> FloatArray:
+    """Leap seconds at the end of days of UTC [s], by modified Julian day: 0 or 1."""
     table = leap_seconds()
     later = np.minimum(day + 1, table.expires)
     return table.at(later) - table.at(day)

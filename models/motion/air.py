@@ -8,12 +8,11 @@ References
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from terrafix.models.core.arrays import FloatArray
+from terrafix.models.core.extras import optional
 from terrafix.models.geometry.geodesy import geodetic_from_ecef_array
 
 _REACH = 1e3
@@ -39,40 +38,34 @@ def air_about(
     Returns
     -------
     tuple of ndarray
-        Natural logarithm of the density in kg/m^3, (n,), and its gradient [1/m], (n, 3).
+        Natural logarithm of the density in kg/m^3, (n,), and its gradient [1/m], (n, 3); not finite
+        where MSIS has none.
 
     Raises
     ------
     ImportError
         If pymsis is not installed; the message says what to install.
     """
-    msis = _pymsis()
+    msis = optional("pymsis", "a density by MSIS")
     r = np.atleast_2d(np.asarray(r_e, np.float64))
     n = len(r)
     steps = _REACH * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
     places = (r[None] + steps[:, None]).reshape(-1, 3)
-    latitude, longitude, height = geodetic_from_ecef_array(places)
     seven = [np.tile(np.broadcast_to(np.asarray(x, np.float64), n), 7) for x in (f107, f107a, ap)]
-    found = msis.calculate(
-        np.full(7 * n, utc),
-        np.degrees(longitude),
-        np.degrees(latitude),
-        height / 1e3,
-        seven[0],
-        seven[1],
-        np.repeat(seven[2][:, None], 7, axis=1),
-    )
-    density = np.asarray(found, np.float64)[:, msis.Variable.MASS_DENSITY]
-    logs = np.log(density).reshape(7, n)
-    return logs[0], (logs[1:4] - logs[4:]).T / (2 * _REACH)
-
-
-def _pymsis() -> Any:
-    try:
-        import pymsis
-    except ImportError as error:
-        raise ImportError(
-            "a density by MSIS needs the package 'pymsis', which is not installed\n"
-            "  install it: pip install 'terrafix[truth]'"
-        ) from error
-    return pymsis
+    density = np.full(7 * n, np.nan)
+    known = np.isfinite(places).all(axis=1)
+    if known.any():
+        latitude, longitude, height = geodetic_from_ecef_array(places[known])
+        found = msis.calculate(
+            np.full(known.sum(), utc),
+            np.degrees(longitude),
+            np.degrees(latitude),
+            height / 1e3,
+            seven[0][known],
+            seven[1][known],
+            np.repeat(seven[2][known, None], 7, axis=1),
+        )
+        density[known] = np.asarray(found, np.float64)[:, msis.Variable.MASS_DENSITY]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(density).reshape(7, n)
+        return logs[0], (logs[1:4] - logs[4:]).T / (2 * _REACH)

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray
-from terrafix.models.core.timescales import Instant, tai_from
+from terrafix.models.core.iers import MJD_ZERO
+from terrafix.models.core.timescales import Instant, leap_at_end, tai_from
 
 SCALES = ("UTC", "GPS", "TAI", "TT")
-"""Time scales that are read."""
+"""Time scales that are read: all but UT1."""
 
 _WRITTEN = re.compile(
     r"(\d{4})-(?:(\d\d)-(\d\d)|(\d{3}))[T ](\d\d):(\d\d):(\d\d)(?:\.(\d+))?Z?", re.ASCII
 )
 _SECOND, _DAY = np.timedelta64(1, "s"), np.timedelta64(1, "D")
-_MJD0 = np.datetime64("1858-11-17", "ns")
 
 
 def scale_named(name: str) -> str:
@@ -88,16 +88,30 @@ def atomic(tags: NDArray[np.datetime64], within: NDArray[np.bool_], scale: str) 
         If leap seconds are needed, and their table is not installed.
     """
     # a leap second belongs to the day before
-    days = (tags - within * _SECOND - _MJD0) // _DAY
-    seconds = (tags - _MJD0 - days * _DAY).astype(np.int64) / 1e9
+    days = (tags - within * _SECOND - MJD_ZERO) // _DAY
+    seconds = (tags - MJD_ZERO - days * _DAY).astype(np.int64) / 1e9
     day = days.astype(np.int64)
     found = tai_from(scale, day, seconds)
     if within.any():
-        after = tai_from(scale, day + 1, np.zeros(len(day)))
-        wrong = within & ~(found.minus(after) < 0)
+        wrong = within & (leap_at_end(day) == 0)
         if wrong.any():
             k = int(np.argmax(wrong))
             raise ValueError(f"there is no leap second before {tags[k].astype('datetime64[D]')}")
+    return found
+
+
+def utc_tag(instant: Instant) -> np.datetime64:
+    """Tag of one instant in UTC; within a leap second, that of the second after it.
+
+    Raises
+    ------
+    ValueError
+        If the table of leap seconds does not reach it.
+    ImportError
+        If that table is not installed.
+    """
+    day, seconds = instant.to("UTC")
+    found: np.datetime64 = MJD_ZERO + day * _DAY + np.timedelta64(round(seconds * 1e9), "ns")
     return found
 
 

@@ -211,7 +211,8 @@ def density_near(r: Any, place: Any, log_density: Any, gradient: Any) -> Any:
             + g_\perp \cdot (r - r_0),
 
     where :math:`g_\perp` is the part of the gradient across :math:`r_0`: a satellite that flies on
-    at one height stays at one density, which a gradient in straight lines would not say.
+    at one height stays at one density, which a gradient in straight lines would not say. Known at
+    the center of the Earth means known nowhere: there is no air then.
 
     Parameters
     ----------
@@ -223,7 +224,8 @@ def density_near(r: Any, place: Any, log_density: Any, gradient: Any) -> Any:
         Of the logarithm [1/m].
     """
     far, here = ca.sqrt(ca.dot(place, place)), ca.sqrt(ca.dot(r, r))
-    up = place / far
+    up = place / ca.fmax(far, 1.0)
     upward = ca.dot(gradient, up)
     across = gradient - upward * up
-    return ca.exp(log_density + upward * (here - far) + ca.dot(across, r - place))
+    density = ca.exp(log_density + upward * (here - far) + ca.dot(across, r - place))
+    return ca.if_else(far > 0, density, 0.0)

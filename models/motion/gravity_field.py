@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.models.core.arrays import FloatArray
+from terrafix.models.geometry.earth import EARTH
 
 SHIPPED = Path(__file__).with_name("egm2008_70.gfc")
 """EGM2008 to degree and order 70."""
@@ -28,6 +29,10 @@ TIDE_SYSTEMS = ("tide_free", "zero_tide", "mean_tide", "unknown")
 _DIRECT = 4.4228e-8 * -0.31460
 """Permanent tide of Sun and Moon in C20, eq. (6.14) of [2]_ without its Love number."""
 _PERMANENT = {"tide_free": 0.0, "zero_tide": _DIRECT * 0.30190, "mean_tide": _DIRECT * 1.30190}
+_NORMALIZE = (
+    "\n  multiply them by sqrt((n + m)! / ((2 - [m = 0]) (2 n + 1) (n - m)!)), or fetch the field "
+    "anew"
+)
 _VARIABLE = ("gfct", "trnd", "dot", "acos", "asin")
 
 
@@ -157,8 +162,7 @@ def read_gfc(path: str | Path) -> GravityField:
     if norm != "fully_normalized":
         raise ValueError(
             f"{path}: coefficients of another normalization: its norm is '{norm}', and "
-            "'fully_normalized' is taken\n  multiply them by "
-            "sqrt((n + m)! / ((2 - [m = 0]) (2 n + 1) (n - m)!)), or fetch the field anew"
+            f"'fully_normalized' is taken{_NORMALIZE}"
         )
     tide_system = head.get("tide_system", "unknown")
     if tide_system not in TIDE_SYSTEMS:
@@ -168,6 +172,11 @@ def read_gfc(path: str | Path) -> GravityField:
     mu, radius = (_number(path, head, key) for key in ("earth_gravity_constant", "radius"))
     degree = int(_number(path, head, "max_degree"))
     C, S = _coefficients(path, lines, end + 1, degree)
+    if degree >= 2 and abs(C[2, 0] / -EARTH.j2 - 1) < 0.01:
+        raise ValueError(
+            f"{path}: coefficients of another normalization: C20 is {C[2, 0]:.6g}, which is the "
+            f"Earth's without one; fully normalized it is {-EARTH.j2 / np.sqrt(5):.6g}{_NORMALIZE}"
+        )
     return GravityField(head.get("modelname", path.stem), mu, radius, tide_system, C, S)
 
 

@@ -54,9 +54,10 @@ from terrafix.models.motion.harmonics import harmonics_beyond_j2
 from terrafix.models.motion.maneuvers import Maneuver, burned, radial_axes, thrust
 from terrafix.models.motion.orbit import below_surface
 from terrafix.models.motion.surroundings import (
-    SIZES,
     Surroundings,
     orientation_at,
+    published_inputs,
+    published_symbols,
     surroundings_at,
     turned,
 )
@@ -252,10 +253,10 @@ def satellite_model(
     parameters = {} if told else dict(start)
     parameters |= {name: ca.SX.sym(name) for name in constants}
     parameters |= {name: ca.SX.sym(name) for name in _parameters_of(forces)}
-    published = {name: ca.SX.sym(name, size) for name, size in SIZES.items()}
+    published = published_symbols()
     turning = {"rotation_rate": ca.SX.sym("rate"), "pole": ca.SX.sym("pole", 2)}
     if surrounded:
-        inputs |= {f"surroundings.{name}": symbol for name, symbol in published.items()}
+        inputs |= published_inputs(published)
         omega = published["omega_e"]
     else:
         parameters |= {**turning, "earth_angle0": ca.SX.sym("earth_angle0")}

@@ -18,7 +18,7 @@ from typing import Any
 
 import casadi as ca
 
-from terrafix.models.geometry.quaternion import from_rotation_vector, product
+from terrafix.models.geometry.quaternion import from_rotation_vector, product, rotation_matrix
 
 SIZES = {
     "time": 1,
@@ -49,6 +49,16 @@ class Surroundings:
     moon_e: Any
 
 
+def published_symbols() -> dict[str, Any]:
+    """A symbol for each of `SIZES`."""
+    return {name: ca.SX.sym(name, size) for name, size in SIZES.items()}
+
+
+def published_inputs(published: dict[str, Any], *names: str) -> dict[str, Any]:
+    """Inputs ``surroundings.*`` of a model that reads what is published, or some of it by name."""
+    return {f"surroundings.{name}": published[name] for name in names or SIZES}
+
+
 def turned(axis: Any, angle: Any, vector: Any) -> Any:
     r"""Components (3,) in axes turned by `angle` about a unit axis: :math:`e^{-[n \times] a} x`."""
     c, s = ca.cos(angle), ca.sin(angle)
@@ -59,10 +69,9 @@ def surroundings_at(published: dict[str, Any], time: Any) -> Surroundings:
     """What was published, turned to a time [s]; `published` has the names of `SIZES`."""
     since = time - published["time"]
     omega = published["omega_e"]
-    rate = ca.sqrt(ca.dot(omega, omega))
-    axis, angle = omega / rate, rate * since
+    turn = rotation_matrix(from_rotation_vector(omega * since))
     sun, moon = (
-        turned(axis, angle, published[f"{body}_e"] + since * published[f"{body}_rate_e"])
+        ca.mtimes(turn, published[f"{body}_e"] + since * published[f"{body}_rate_e"])
         for body in ("sun", "moon")
     )
     return Surroundings(omega, sun, moon)

@@ -22,8 +22,13 @@ import casadi as ca
 
 from terrafix.models.core.model import Model
 from terrafix.models.geometry.quaternion import from_rotation_vector, rotation_matrix
+from terrafix.models.motion.surroundings import (
+    published_inputs,
+    published_symbols,
+    surroundings_at,
+)
 from terrafix.models.sensors.altimeter import wandering
-from terrafix.models.sensors.sky import Sky, angle_between, hidden, unit
+from terrafix.models.sensors.sky import angle_between, hidden, unit
 
 _NAMES = ("half_angle", "sigma", "bias_sigma", "bias_time")
 
@@ -39,10 +44,13 @@ def sun_sensor_model() -> Model:
         ``fix.y``, ``fix.R``, ``fix.valid``, and ``lit``, 1 where the Earth does not hide the Sun.
     """
     time = ca.SX.sym("time")
-    around, r_e = Sky(time), ca.SX.sym("r_e", 3)
-    there = unit(around.of("sun") - r_e)
+    published, r_e = published_symbols(), ca.SX.sym("r_e", 3)
+    there = unit(surroundings_at(published, time).sun_e - r_e)
     lit = ca.logic_not(hidden(there, r_e))
-    inputs = {"r_e": r_e, **around.read("sun_e", "sun_rate_e")}
+    inputs = {
+        "r_e": r_e,
+        **published_inputs(published, "time", "omega_e", "sun_e", "sun_rate_e"),
+    }
     return _direction("sun_sensor", inputs, there, lit, {"lit": lit}, time)
 
 

@@ -1,12 +1,4 @@
-r"""Sun, Moon and stars as a satellite sees them, between publications of what surrounds it.
-
-What is published holds for an instant; :math:`s` seconds later, with the Earth's rotation
-:math:`\omega` and the inertial velocity :math:`u` of a body, both in Earth-fixed axes,
-
-.. math::
-    C = e^{-[\omega s \times]}, \qquad
-    r_{sun}(s) = C\,(r_{sun} + u s), \qquad
-    q_{ei}(s) = q(\omega s) \otimes q_{ei}.
+r"""What is where in the sky of a satellite: directions, angles, and what the Earth hides.
 
 The Earth is a sphere of its equatorial radius where it hides something or is looked at: its limb
 lies :math:`\arcsin(R / r)` off its center.
@@ -19,47 +11,6 @@ from typing import Any
 import casadi as ca
 
 from terrafix.models.geometry.earth import EARTH
-from terrafix.models.geometry.quaternion import from_rotation_vector, product, rotation_matrix
-
-FIELDS = {
-    "time": 1,
-    "omega_e": 3,
-    "q_ei": 4,
-    "sun_e": 3,
-    "sun_rate_e": 3,
-    "moon_e": 3,
-    "moon_rate_e": 3,
-}
-"""Sizes of what is published, by name."""
-
-
-class Sky:
-    """Where things in the sky are at a time.
-
-    Parameters
-    ----------
-    time : SX
-        [s]
-    """
-
-    def __init__(self, time: Any) -> None:
-        self.symbols = {name: ca.SX.sym(name, size) for name, size in FIELDS.items()}
-        self._since = time - self.symbols["time"]
-        self._turn = from_rotation_vector(self._since * self.symbols["omega_e"])
-
-    def of(self, body: str) -> Any:
-        """Position (3,) [m] of the "sun" or "moon" from the Earth's center, Earth-fixed."""
-        there, rate = self.symbols[f"{body}_e"], self.symbols[f"{body}_rate_e"]
-        return ca.mtimes(rotation_matrix(self._turn), there + self._since * rate)
-
-    @property
-    def q_ei(self) -> Any:
-        """Inertial to Earth-fixed axes, (4,)."""
-        return product(self._turn, self.symbols["q_ei"])
-
-    def read(self, *names: str) -> dict[str, Any]:
-        """Inputs of a model that reads some of what is published, by name of field."""
-        return {f"surroundings.{n}": self.symbols[n] for n in ("time", "omega_e", *names)}
 
 
 def unit(vector: Any) -> Any:

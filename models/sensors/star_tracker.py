@@ -34,7 +34,13 @@ from terrafix.models.geometry.quaternion import (
     rotation_matrix,
     rotation_vector,
 )
-from terrafix.models.sensors.sky import Sky, angle_between, hidden, limb_angle, unit
+from terrafix.models.motion.surroundings import (
+    orientation_at,
+    published_inputs,
+    published_symbols,
+    surroundings_at,
+)
+from terrafix.models.sensors.sky import angle_between, hidden, limb_angle, unit
 
 SKIES = ("environment", "none")
 """Whether Sun, Moon and inertial axes are those of the environment, or the axes turn uniformly."""
@@ -82,12 +88,12 @@ def star_tracker_model(sky: str = "environment") -> Model:
     off_earth = angle_between(b_e, -unit(r_e)) - limb_angle(r_e)
     blocked: Any = ca.if_else(off_earth < p["earth_exclusion"], 3, 0)
     if sky == "environment":
-        around = Sky(time)
-        inputs |= around.read("q_ei", "sun_e", "sun_rate_e", "moon_e", "moon_rate_e")
-        q_ei = around.q_ei
-        for code, body in ((2, "moon"), (1, "sun")):
+        published = published_symbols()
+        inputs |= published_inputs(published)
+        q_ei, around = orientation_at(published, time), surroundings_at(published, time)
+        for code, body, place in ((2, "moon", around.moon_e), (1, "sun", around.sun_e)):
             p[f"{body}_exclusion"] = ca.SX.sym(f"{body}_exclusion")
-            there = unit(around.of(body) - r_e)
+            there = unit(place - r_e)
             near = angle_between(b_e, there) < p[f"{body}_exclusion"]
             seen = ca.logic_and(near, ca.logic_not(hidden(there, r_e)))
             blocked = ca.if_else(seen, code, blocked)

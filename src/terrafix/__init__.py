@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from terrafix.cosim.basics.clock import Rate as Rate
     from terrafix.cosim.basics.errors import CheckpointError as CheckpointError
     from terrafix.cosim.basics.errors import ConfigurationError as ConfigurationError
+    from terrafix.cosim.basics.errors import EpochError as EpochError
     from terrafix.cosim.basics.errors import RateError as RateError
     from terrafix.cosim.basics.errors import StepError as StepError
     from terrafix.cosim.basics.errors import SystemCheckError as SystemCheckError
@@ -121,6 +122,7 @@ _FROM = {
     "TerrafixError": "cosim.basics.errors",
     "ConfigurationError": "cosim.basics.errors",
     "WiringError": "cosim.basics.errors",
+    "EpochError": "cosim.basics.errors",
     "RateError": "cosim.basics.errors",
     "CheckpointError": "cosim.basics.errors",
     "StepError": "cosim.basics.errors",

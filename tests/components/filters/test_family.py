@@ -461,9 +461,8 @@ def test_a_measurement_of_a_block_that_is_none_is_refused_before_the_run():
         default_rate = tf.Rate("1", offset="1")
         error_state, observation = STATE, Observation(lambda x, _: x["w"], {"range": "m"})
 
-    assert "Wrong cannot build its model: there is no block 'w'; the blocks are r, v" in refused(
-        Wrong
-    )
+    said = "'correct' cannot build its model: there is no block 'w'; the blocks are r, v"
+    assert said in refused(Wrong)
 
 
 def test_noise_of_another_size_is_refused_before_the_run():

@@ -7,7 +7,7 @@ import pytest
 from terrafix.components.truth.atmosphere import Atmosphere
 from terrafix.components.truth.satellite_orbit import SatelliteOrbit
 from terrafix.cosim.basics.clock import Rate
-from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
+from terrafix.cosim.basics.errors import SystemCheckError
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.system.system import System
 from terrafix.models.core.batch import over_members
@@ -58,16 +58,14 @@ def test_it_holds_until_the_next_publication():
     assert abs(near / expected - 1) < 0.5 * abs(np.exp(logs[0]) / expected - 1)
 
 
-def falling(**settings):
-    system = System("falling", duration="60 s")
+def falling(epoch="2022-09-18T07:49:21 UTC"):
+    system = System("falling", duration="60 s", epoch=epoch)
     begin = {"start_from": "parameters", "r0_e": R_E, "v0_e": V_E, "gravity": "j2"}
     orbit = system.add(
         SatelliteOrbit(rate=Rate(hz=10), drag="atmosphere", ballistic_coefficient=0.02, **begin),
         "orbit",
     )
-    air = system.add(
-        Atmosphere(**{"epoch": "2022-09-18T07:49:21 UTC", **ACTIVITY, **settings}), "air"
-    )
+    air = system.add(Atmosphere(**ACTIVITY), "air")
     system.connect(orbit["r_e"], air["r_e"])
     system.connect(air["air"], orbit["atmosphere"])
     system.record("all", ["orbit.delta_v_e", "orbit.r_e"])
@@ -87,21 +85,25 @@ def test_a_satellite_feels_the_air_that_is_there():
         )
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"epoch": "yesterday"}, "'air.epoch' is 'yesterday', which is no date in UTC"),
-        ({"epoch": "2022-09-18T07:49:21 GPS"}, "which is no date in UTC"),
-        ({"epoch": "NaT"}, "which is no date in UTC"),
-    ],
-)
-def test_dates_that_are_refused(settings, message):
-    with pytest.raises((SystemCheckError, ConfigurationError), match=message):
-        simulate(falling(**settings))
+def test_the_date_is_that_of_the_system():
+    """GPS is 18 s ahead of UTC: the same instant, the same bits."""
+    same = [falling(), falling("2022-09-18T07:49:39 GPS")]
+    felt = [simulate(s, duration="10").dataset["orbit.delta_v_e"].values for s in same]
+    assert felt[0].tobytes() == felt[1].tobytes()
+    with pytest.raises(SystemCheckError, match="'air' needs to know what time it is"):
+        simulate(falling(None))
+
+
+def test_a_place_that_is_none_has_no_air_and_leaves_the_others_theirs():
+    logs, gradients = air_about([[np.nan] * 3, R_E], EPOCH, 140.0, 130.0, 12.0)
+    alone = air_about(R_E, EPOCH, 140.0, 130.0, 12.0)
+    assert np.isnan(logs[0])
+    np.testing.assert_array_equal(logs[1], alone[0][0])
+    np.testing.assert_array_equal(gradients[1], alone[1][0])
 
 
 def test_there_is_no_density_without_indices():
-    system = System("bare", duration="1 s")
-    system.add(Atmosphere(epoch="2022-09-18T07:49:21 UTC", f107=140.0, f107a=130.0), "air")
+    system = System("bare", duration="1 s", epoch="2022-09-18T07:49:21 UTC")
+    system.add(Atmosphere(f107=140.0, f107a=130.0), "air")
     with pytest.raises(SystemCheckError, match="'ap'"):
         simulate(system)

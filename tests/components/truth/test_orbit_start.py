@@ -151,7 +151,7 @@ OLD = {"kind": "tle", "tle": VANGUARD}
     ("epoch", "settings", "said"),
     [
         (EPOCH, STATE, "a state without a frame, in a system with the epoch '2022-09-18T07:49:21"),
-        (None, STATE | {"frame": "gcrf"}, "a state in the frame 'gcrf', which say nothing about"),
+        (None, STATE | {"frame": "gcrf"}, "a state in the frame 'gcrf', which says nothing about"),
         (None, OLD, "two-line elements, which say nothing about the Earth without a date"),
         (EPOCH, OLD, "at the epoch 8.12e.03 days old; it takes them up to 3 days"),
         ("2000-06-20T00:00:00 UTC", OLD, "at the epoch 7.78 days ahead of it; it takes"),

@@ -32,16 +32,16 @@ COEFFICIENT = PHYSICAL["area"] / PHYSICAL["mass"]
 quaternion_of = over_members(from_matrix, (3, 3))
 
 
-def use_tables() -> None:
+def use_tables(eop: dict[str, float] = EOP) -> None:
     """Give brahe its Earth orientation."""
     # brahe 1.8.0 takes the first three under each other's names: what it has then is looked at
     names = {"pm_x": "ut1_utc", "pm_y": "pm_x", "ut1_utc": "pm_y"}
-    values = {names.get(name, name): value for name, value in EOP.items()}
+    values = {names.get(name, name): value for name, value in eop.items()}
     brahe.set_global_eop_provider_from_static_provider(
         brahe.StaticEOPProvider.from_values(**values)
     )
-    assert brahe.get_global_ut1_utc(59840.3) == EOP["ut1_utc"]
-    assert brahe.get_global_pm(59840.3) == (EOP["pm_x"], EOP["pm_y"])
+    assert brahe.get_global_ut1_utc(59840.3) == eop["ut1_utc"]
+    assert brahe.get_global_pm(59840.3) == (eop["pm_x"], eop["pm_y"])
 
 
 def epoch() -> brahe.Epoch:
