@@ -130,6 +130,17 @@ class SatelliteOrbit(SymbolicComponent):
                 f'  say where it starts: {self.name}.r0_e = "[7070, 0, 0] km"'
             )
 
+    def validate_epoch(self, epoch: str | None) -> None:
+        """Refuse a date without surroundings: r_i and v_i are then of axes that have none."""
+        if epoch is not None and not self.setting("surrounded"):
+            raise ConfigurationError(
+                f"'{self.name}' puts out 'r_i' and 'v_i' in axes from which the Earth turns "
+                f"uniformly, in a system with the epoch '{epoch}': taken for GCRF they lie "
+                "kilometers off\n"
+                f"  set {self.name}.surrounded = true and connect a component of type environment; "
+                "or leave the epoch out"
+            )
+
     def validate_duration(self, duration: float) -> None:
         """Look whether the maneuvers lie within the run."""
         for name, each in self._maneuvers().items():

@@ -175,6 +175,14 @@ def test_what_is_refused_before_it_flies(settings, message):
         simulate(alone(**settings))
 
 
+def test_a_date_without_surroundings_is_refused():
+    """Its inertial outputs would be of axes of no date, kilometers from those of GCRF."""
+    system = System("dated", duration="1", epoch="2022-09-18T07:49:21 UTC")
+    system.add(SatelliteOrbit(degree=2, **BEGIN), "satellite")
+    with pytest.raises(SystemCheckError, match=r"set satellite.surrounded = true and connect"):
+        simulate(system)
+
+
 def test_what_would_change_nothing_is_said():
     orbit = alone(gravity="j2").nodes["orbit"]
     for name in ("degree", "gravity_file", "wind", "density", "radiation_coefficient"):
