@@ -34,7 +34,7 @@ from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.radar.boresight import Boresight, boresight_on_terrain
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.echo import Acquisition, simulated_echo
-from terrafix.models.radar.recording import RecordedLines
+from terrafix.models.radar.recordings.recording import Recording
 
 _BEYOND = 5.0
 """Arc beyond all apertures [s]: the corners of the surface that is looked up are seen that late."""
@@ -209,13 +209,13 @@ class RecordedEcho(_Echo):
         for t, path in require_files(self, duration):
             self._check_time(read_lines(self, path), path, t)
 
-    def _first_time(self, lines: RecordedLines) -> float:
+    def _first_time(self, lines: Recording) -> float:
         start, prf = (float(shared_setting(self, name)) for name in ("start_line", "prf"))
         return (lines.first_line - start) / prf
 
-    def _check_time(self, lines: RecordedLines, path: Path, t: float) -> None:
+    def _check_time(self, lines: Recording, path: Path, t: float) -> None:
         first = self._first_time(lines)
-        last = first + (len(lines.echo) - 1) / float(shared_setting(self, "prf"))
+        last = first + (lines.n_lines - 1) / float(shared_setting(self, "prf"))
         if not first <= t <= last:
             raise ConfigurationError(
                 f"'{self.name}' is to publish '{path.name}' at {t:g} s, but its lines were "
@@ -229,4 +229,4 @@ class RecordedEcho(_Echo):
         self._check_time(lines, path, t)
         near = float(common(self, "range0"))
         near += (lines.first_cell - 1) * self._radar().range_spacing
-        self._publish(t, lines.echo, self._first_time(lines), near)
+        self._publish(t, lines.read(), self._first_time(lines), near)

@@ -8,13 +8,14 @@ from pathlib import Path
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.models.radar.recording import RecordedLines, read_recording
+from terrafix.models.radar.recordings.files import read_recording
+from terrafix.models.radar.recordings.recording import Recording
 
 _log = logging.getLogger(__name__)
 
 
-def read_lines(component: Component, path: Path, *, report: bool = False) -> RecordedLines:
-    """Recorded lines in a file of a component; `report` says if some were lost."""
+def read_lines(component: Component, path: Path, *, report: bool = False) -> Recording:
+    """Recording in a file of a component; `report` says if lines were lost."""
     try:
         lines = read_recording(path)
     except (OSError, ValueError) as error:

@@ -15,7 +15,7 @@ from terrafix.models.core.arrays import read_arrays
 from terrafix.models.images.reference import read_reference
 from terrafix.models.maps.dem import read_dem
 from terrafix.models.motion.ephemeris import read_eof
-from terrafix.models.radar.recording import read_recording
+from terrafix.models.radar.recordings.files import read_recording
 
 VALUES = np.arange(12.0).reshape(3, 4)
 WHAT = {
