@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from terrafix.models.core.arrays import ComplexArray, FloatArray, Single, read_arrays
 from terrafix.models.radar.chirp import gain_of
 from terrafix.models.radar.recordings.lines import on_grid, places_by_number, places_by_time
-from terrafix.models.radar.recordings.recording import Recording, lost_lines
+from terrafix.models.radar.recordings.recording import WHAT, Recording, lost_lines
 
 PLACE = ("first_rg_line", "first_rg_cell")
-WHAT = "recorded echo"
 _OPTIONAL = ("echo", "i", "q", "agc_db", "line_number", "line_time_s")
 
 

@@ -114,8 +114,15 @@ def places_by_time(times: FloatArray, name: str) -> NDArray[np.intp]:
     ValueError
         If they do not increase by whole lines.
     """
-    spacing = float(np.median(np.diff(times)))
-    return places_by_number((times - times[0]) / spacing if spacing > 0 else times, name)
+    steps = np.diff(times)
+    spacing = float(np.median(steps))
+    counted = steps / spacing if spacing > 0 else np.zeros(len(steps))
+    wrong = ~((counted > _OFF_GRID) & (np.abs(counted - np.rint(counted)) <= _OFF_GRID))
+    if wrong.any():
+        raise ValueError(
+            f"'{name}' does not count lines one by one: look at its element {np.argmax(wrong) + 1}"
+        )
+    return np.concatenate([[0], np.cumsum(np.rint(counted), dtype=np.intp)])
 
 
 def on_grid(times: FloatArray, place: NDArray[np.intp]) -> FloatArray:

@@ -19,6 +19,12 @@ from terrafix.models.motion.ephemeris import Ephemeris
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.recordings.lines import MOST_LOST, Neighbors, refuse_slips
 
+WHAT = "recorded echo"
+FORMATS = (
+    "recorded echo is a file of NumPy (.npz) with the arrays i and q (or echo), first_rg_line and "
+    "first_rg_cell, or NISAR L0B (HDF5)"
+)
+IMAGE = "an image, formed already: name the raw echo (level 0) that it was formed of"
 _BLOCK = 2**22
 """Samples that are in memory at a time: 32 MB."""
 

@@ -77,6 +77,7 @@ def test_a_file_of_another_kind_is_named_with_what_to_do(tmp_path, kind, read):
     assert f"it is {what}\n" in text
     assert cure in text
     assert "is a file of NumPy (.npz) with the arrays " in text
+    assert "pickle=" not in text
     assert "allow_pickle" not in text
 
 
