@@ -22,6 +22,7 @@ from terrafix.models.radar.recordings.lines import on_grid, places_by_number, pl
 from terrafix.models.radar.recordings.recording import WHAT, Recording, lost_lines
 
 PLACE = ("first_rg_line", "first_rg_cell")
+_SLIPPED = "give it the number of every line (line_number), or its time (line_time_s)"
 _OPTIONAL = ("echo", "i", "q", "agc_db", "line_number", "line_time_s")
 
 
@@ -69,7 +70,7 @@ def read_npz(path: Path) -> Recording:
         first = [_number(arrays[k], k) for k in PLACE]
         place, times = _places(arrays, n)
         lines = ArrayLines(parts, gain)
-        lost = lost_lines(lines, place)
+        lost = lost_lines(lines, place, _SLIPPED)
     except ValueError as error:
         raise ValueError(f"'{path}' is not {WHAT}: {error}") from error
     return Recording(path, lines, place, lost, times, first[0], first[1])

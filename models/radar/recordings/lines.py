@@ -62,7 +62,7 @@ class Neighbors:
         return np.asarray((alike * np.conj(total)).real / max(abs(total), 1e-30), np.float64)
 
 
-def refuse_slips(neighbors: Neighbors, place: NDArray[np.intp]) -> None:
+def refuse_slips(neighbors: Neighbors, place: NDArray[np.intp], cure: str) -> None:
     """Raise ValueError where two lines are no neighbors, though those about them are.
 
     Parameters
@@ -70,6 +70,8 @@ def refuse_slips(neighbors: Neighbors, place: NDArray[np.intp]) -> None:
     neighbors : Neighbors
     place : ndarray of int, shape (n,)
         Where each line belongs, counted from 0: those with others between are not compared.
+    cure : str
+        What to do about it, for the message.
     """
     from scipy.ndimage import median_filter
 
@@ -84,7 +86,7 @@ def refuse_slips(neighbors: Neighbors, place: NDArray[np.intp]) -> None:
         k = int(place[pairs[np.argmax(fallen)]]) + 1
         raise ValueError(
             f"lines {k} and {k + 1} are no neighbors, as others are: lines between them are lost\n"
-            "  give it the number of every line (line_number), or its time (line_time_s)"
+            f"  {cure}"
         )
 
 

@@ -50,6 +50,7 @@ from terrafix.models.radar.recordings.recording import (
 
 BANDS = ("LSAR", "SSAR")
 _EPOCH = re.compile(r"seconds since (\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)")
+_SLIPPED = "its 'UTCtime' does not say so: have the times corrected by whoever made the file"
 _TOLD = 6
 """Names of what a file of another kind holds that are told."""
 _N_CODES = 65536
@@ -179,7 +180,7 @@ def _recording(path: Path, file: Any, channel: str) -> Recording:
         *(path, samples, shape, _table(rx, file[samples]), _valid(tx, n), _gain(rx, n))
     )
     return Recording(
-        *(path, lines, place, lost_lines(lines, place), line_time, first_line),
+        *(path, lines, place, lost_lines(lines, place, _SLIPPED), line_time, first_line),
         near_range=float(ranges[0]),
         sent=sent,
         track=_track(file[root], epoch),

@@ -193,7 +193,7 @@ def seconds(span: np.timedelta64) -> float:
     return float(span / np.timedelta64(1, "ns")) * 1e-9
 
 
-def lost_lines(lines: Lines, place: NDArray[np.intp]) -> NDArray[np.intp]:
+def lost_lines(lines: Lines, place: NDArray[np.intp], cure: str) -> NDArray[np.intp]:
     """Look through lines once: numbers of the lost ones, counted from 1.
 
     Parameters
@@ -201,6 +201,8 @@ def lost_lines(lines: Lines, place: NDArray[np.intp]) -> NDArray[np.intp]:
     lines : Lines
     place : ndarray of int, shape (n,)
         Line of the recording that each of them is, counted from 0.
+    cure : str
+        What to do about lines that slipped, for the message.
 
     Raises
     ------
@@ -223,7 +225,7 @@ def lost_lines(lines: Lines, place: NDArray[np.intp]) -> NDArray[np.intp]:
             f"{n_lost} of its {len(there)} lines are missing (zero), the first is line "
             f"{int(np.argmin(there)) + 1}; {MOST_LOST:.0%} of them may be"
         )
-    refuse_slips(neighbors, place)
+    refuse_slips(neighbors, place, cure)
     return np.flatnonzero(~there) + 1
 
 
