@@ -291,11 +291,11 @@ class RecordedReference(_Reference):
         )
         dem = dem_from(self.height, self.grid)
         aligned = np.array([0.0, 0.0, 0.0, 1.0])
-        duration = len(lines.echo) / radar.prf
+        duration = lines.n_lines / radar.prf
         try:
             beam = boresight_on_terrain(r, v, q_be, aligned, float(look), float(squint), dem)
             imager = Imager(
-                lines.echo,
+                lines.read(),
                 radar,
                 near,
                 first_time,
