@@ -11,9 +11,6 @@ The track is that of the file: state vectors, Earth-fixed, between which
 `terrafix.models.motion.ephemeris` interpolates, and quaternions, scalar first, that turn
 components along the antenna's axes into Earth-fixed ones, z being the boresight.
 
-The file is read by netCDF4, whose texts of a fixed length may end in bytes that are not theirs:
-epochs are read as dates with whole seconds, and what follows is not looked at.
-
 References
 ----------
 .. [1] NASA JPL, "NISAR L0B product specification", D-102268.
@@ -31,9 +28,9 @@ from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import ComplexArray, FloatArray, Single
 from terrafix.models.core.formats import HDF5
+from terrafix.models.core.hdf5 import epoch_of, has_group, opened, values_of
 from terrafix.models.geometry.quaternion import from_scalar_first
-from terrafix.models.motion.ephemeris import Ephemeris
-from terrafix.models.motion.orbits.states import check_distance, check_motion
+from terrafix.models.motion.orbits.hdf5 import orbit_of
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT, gain_of
 from terrafix.models.radar.recordings.lines import on_grid, places_by_number, places_by_time
 from terrafix.models.radar.recordings.recording import (
@@ -49,7 +46,6 @@ from terrafix.models.radar.recordings.recording import (
 )
 
 BANDS = ("LSAR", "SSAR")
-_EPOCH = re.compile(r"seconds since (\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)")
 _SLIPPED = "its 'UTCtime' does not say so: have the times corrected by whoever made the file"
 _TOLD = 6
 """Names of what a file of another kind holds that are told."""
@@ -105,24 +101,6 @@ class CodeLines:
         return echo if self._gain is None else echo * self._gain[first:last, None]
 
 
-def opened(path: Path) -> Any:
-    """A file of HDF5, open, whose values come as they are.
-
-    Raises
-    ------
-    ValueError
-        If it is damaged.
-    """
-    from netCDF4 import Dataset
-
-    try:
-        file = Dataset(path)
-    except OSError as error:
-        raise ValueError(f"it is {HDF5}\n  it is damaged ({error})\n  {FORMATS}") from error
-    file.set_auto_maskandscale(False)
-    return file
-
-
 def read_l0b(path: Path, channel: str = "") -> Recording:
     """Read one channel of recorded echo (NISAR L0B, HDF5).
 
@@ -148,7 +126,7 @@ def read_l0b(path: Path, channel: str = "") -> Recording:
 
 
 def _recording(path: Path, file: Any, channel: str) -> Recording:
-    band = next((b for b in BANDS if _has(file, f"science/{b}/RRSD/swaths")), None)
+    band = next((b for b in BANDS if has_group(file, f"science/{b}/RRSD/swaths")), None)
     if band is None:
         raise ValueError(_another(file))
     root = f"science/{band}/RRSD"
@@ -156,16 +134,16 @@ def _recording(path: Path, file: Any, channel: str) -> Recording:
     sent_group, samples = name.rpartition("/rx")[0], f"{root}/swaths/{name}"
     tx = file[f"{root}/swaths/{sent_group}"]
     n, n_cells = shape = _shape(file[samples])
-    times = _values(tx, "UTCtime", (n,))
-    epoch = _epoch(tx["UTCtime"])
+    times = values_of(tx, "UTCtime", (n,))
+    epoch = epoch_of(tx["UTCtime"])
     place = places_by_time(times, "UTCtime")
     first_line = 1
     if "rangeLineIndex" in tx.variables:
-        numbers = _values(tx, "rangeLineIndex", (n,))
+        numbers = values_of(tx, "rangeLineIndex", (n,))
         first_line = int(numbers[0])
         if not np.array_equal(place, places_by_number(numbers, "rangeLineIndex")):
             raise ValueError("'UTCtime' and 'rangeLineIndex' do not agree where lines were lost")
-    ranges = _values(tx, "slantRange", (n_cells,))
+    ranges = values_of(tx, "slantRange", (n_cells,))
     line_time = on_grid(times, place)
     sent = Sent(
         carrier=_number(tx, "centerFrequency"),
@@ -216,7 +194,7 @@ def _another(file: Any) -> str:
     products = [
         name
         for band in BANDS
-        if _has(file, f"science/{band}")
+        if has_group(file, f"science/{band}")
         for name in file[f"science/{band}"].groups
         if name != "identification"
     ]
@@ -224,14 +202,6 @@ def _another(file: Any) -> str:
     told = f"a NISAR product '{products[0]}': {IMAGE}" if products else f"it holds {held}"
     cure = "if it holds raw echo, read it with h5py or xarray, and write its arrays with"
     return f"it is {HDF5}\n  {told}\n  {FORMATS}\n  {cure} numpy.savez"
-
-
-def _has(file: Any, name: str) -> bool:
-    for part in name.split("/"):
-        if part not in file.groups:
-            return False
-        file = file.groups[part]
-    return True
 
 
 def _shape(data: Any) -> tuple[int, int]:
@@ -242,30 +212,8 @@ def _shape(data: Any) -> tuple[int, int]:
     return int(data.shape[0]), int(data.shape[1])
 
 
-def _values(group: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
-    """A data set of finite numbers; -1 in the shape is any length."""
-    if name not in group.variables:
-        raise ValueError(f"its '{group.path}' has no '{name}'")
-    values = np.asarray(group[name][...], np.float64)
-    if len(values.shape) != len(shape) or any(
-        m not in (-1, k) for k, m in zip(values.shape, shape, strict=True)
-    ):
-        raise ValueError(f"'{name}' has shape {values.shape}, not {shape}")
-    if not np.isfinite(values).all():
-        raise ValueError(f"'{name}' is not finite")
-    return values
-
-
 def _number(group: Any, name: str) -> float:
-    return float(_values(group, name, ()))
-
-
-def _epoch(times: Any) -> np.datetime64:
-    units = str(getattr(times, "units", ""))
-    found = _EPOCH.match(units)
-    if found is None:
-        raise ValueError(f"its '{times.name}' counts '{units}', not seconds since an epoch")
-    return np.datetime64(f"{found[1]}T{found[2]}", "ns")
+    return float(values_of(group, name, ()))
 
 
 def _spacing(ranges: FloatArray) -> float:
@@ -282,19 +230,19 @@ def _table(rx: Any, data: Any) -> Single | None:
         return None
     if any(data.dtype[k] != np.uint16 for k in ("r", "i")):
         raise ValueError(f"its samples are {data.dtype}, not codes of 16 bits or floats")
-    return _values(rx, "BFPQLUT", (_N_CODES,)).astype(np.float32)
+    return values_of(rx, "BFPQLUT", (_N_CODES,)).astype(np.float32)
 
 
 def _valid(tx: Any, n: int) -> list[NDArray[np.int64]]:
     names = sorted(k for k in tx.variables if re.fullmatch(r"validSamplesSubSwath\d+", k))
-    return [_values(tx, k, (n, 2)).astype(np.int64) for k in names]
+    return [values_of(tx, k, (n, 2)).astype(np.int64) for k in names]
 
 
 def _gain(rx: Any, n: int) -> Single | None:
     """Factors that undo an attenuation that varies, in dB."""
     if "attenuation" not in rx.variables:
         return None
-    attenuation = _values(rx, "attenuation", (n, -1))
+    attenuation = values_of(rx, "attenuation", (n, -1))
     if np.ptp(attenuation, axis=0).max() == 0:
         return None
     units = str(getattr(rx["attenuation"], "units", ""))
@@ -317,26 +265,9 @@ def _track(root: Any, epoch: np.datetime64) -> Track:
     )
 
 
-def orbit_of(group: Any) -> Ephemeris:
-    """Ephemeris of a group of state vectors, of products of any level.
-
-    Raises
-    ------
-    ValueError
-        If they lack something, or cannot be those of a satellite.
-    """
-    t = _values(group, "time", (-1,))
-    r, v = (_values(group, name, (len(t), 3)) for name in ("position", "velocity"))
-    tags = _epoch(group["time"]) + np.rint(t * 1e9).astype("timedelta64[ns]")
-    check_distance(r)
-    orbit = Ephemeris(tags, t - t[0], r, v)
-    check_motion(orbit)
-    return orbit
-
-
 def _attitude(group: Any, epoch: np.datetime64) -> AntennaAttitude:
-    t = _values(group, "time", (-1,))
-    q = _values(group, "quaternions", (len(t), 4))
+    t = values_of(group, "time", (-1,))
+    q = values_of(group, "quaternions", (len(t), 4))
     if (np.diff(t) <= 0).any() or np.abs(np.linalg.norm(q, axis=1) - 1).max() > _UNIT:
         raise ValueError("its attitude is no unit quaternions at times that increase")
-    return AntennaAttitude(t + seconds(_epoch(group["time"]) - epoch), from_scalar_first(q))
+    return AntennaAttitude(t + seconds(epoch_of(group["time"]) - epoch), from_scalar_first(q))
