@@ -191,8 +191,8 @@ class RecordedOrbit(Component):
     From an orbit file of others (OEM, SP3-c, SP3-d, EOF, table, NISAR's HDF5), whose states are
     interpolated to the eighth order, or from a result of terrafix (.nc), played sample by sample.
     A run begins at the system's epoch, or where it has none `start` after the first state. What a
-    file does not hold is supplied: `delta_v_e` is zero; inertial axes are GCRF in a system with an epoch, else
-    the Earth-fixed ones of t = 0 turned by `earth_angle0`.
+    file does not hold is supplied: `delta_v_e` is zero; inertial axes are GCRF in a system with an
+    epoch, else the Earth-fixed ones of t = 0 turned by `earth_angle0`.
     """
 
     default_rate = Rate(hz=100)
