@@ -15,6 +15,7 @@ from terrafix.models.motion.orbits.files import read_orbit
 from terrafix.models.radar.chirp import range_compressed
 from terrafix.models.radar.doppler import fractional_centroid
 from terrafix.models.radar.recordings.files import read_recording
+from terrafix.models.radar.recordings.nisar import _shape
 
 ECHO = "ALPSRP264757150-H1.0__A_HH_LINE4000-5000_RANGE0-2200.h5"
 REFLECTOR = "calib_RSLC_ALPSRP025826990_RIO_BRANCO_CR.h5"
@@ -105,7 +106,7 @@ def test_palsars_corner_reflector_is_where_its_orbit_says(data_folder, channel, 
 
     `at` is where the samples of a channel begin in the file, halves of 16 bits, which netCDF4 does
     not read. The reflector's place was derived from this product. VV is 1.1 m farther in range at
-    the same line: the delay of its channel.
+    the same line, presumably by the delay of its channel.
     """
     path = palsar(data_folder, REFLECTOR)
     place = ecef(np.radians(-9.71311741457592), np.radians(-68.1728216904995), 0.0)
@@ -132,6 +133,14 @@ def test_palsars_corner_reflector_is_where_its_orbit_says(data_folder, channel, 
     assert np.hypot(along, beyond / np.sin(incidence)) < 1.0
     assert along == pytest.approx(0.0, abs=0.05)
     assert beyond == pytest.approx(0.0, abs=0.05)
+
+
+def test_halves_of_16_bits_are_not_read(data_folder):
+    """Those of the reflector's image, which netCDF4 opens without their fields."""
+    with opened(palsar(data_folder, REFLECTOR)) as file:
+        samples = file["science/LSAR/RSLC/swaths/frequencyA/VV"]
+        with pytest.raises(ValueError, match="not pairs 'r', 'i' of a type that is read"):
+            _shape(samples)
 
 
 def _peak(image):
