@@ -29,7 +29,7 @@ from terrafix.models.radar.focusing import (
     azimuth_looks,
     range_doppler,
 )
-from terrafix.models.radar.recording import read_recording
+from terrafix.models.radar.recordings.files import read_recording
 from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
 ROOT = Path(__file__).parents[1]
@@ -102,11 +102,12 @@ def speed() -> None:
 
 def domain_of(name: str) -> RangeDoppler:
     lines = read_recording(DATA / "radarsat1_vancouver" / f"{name}.npz")
+    echo = lines.read()
     near = 988647.462 + (lines.first_cell - 1) * RADARSAT.range_spacing
-    fraction, _ = fractional_centroid(lines.echo, RADARSAT.prf)
+    fraction, _ = fractional_centroid(echo, RADARSAT.prf)
     centroid = unwrapped_centroid(fraction, RADARSAT.prf, -6900.0)
     return range_doppler(
-        lines.echo, RADARSAT, near_range=near, centroid=centroid, velocity=7062.0
+        echo, RADARSAT, near_range=near, centroid=centroid, velocity=7062.0
     ).cropped()
 
 

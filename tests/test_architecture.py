@@ -21,7 +21,7 @@ WINGS = {
 ORDER = [
     *("models.core", "models.geometry", "models.motion", "models.motion.orbits"),
     *("models.maps", "models.sensors"),
-    *("models.radar", "models.images", "models.filters", "models"),
+    *("models.radar", "models.radar.recordings", "models.images", "models.filters", "models"),
     *("cosim.basics", "cosim.show", "cosim.memory", "cosim.declare", "cosim.kernels"),
     *("cosim.system", "cosim.files", "cosim.records", "cosim.engine", "cosim.lincov"),
     *("cosim.campaign.statistics", "cosim.campaign", "cosim.report"),

@@ -16,6 +16,7 @@ from terrafix.components.sensors.aperture import MARK
 from terrafix.components.sensors.compiled import row_operations
 from terrafix.components.sensors.files import (
     file_of_step,
+    near_range,
     read_lines,
     recorded_files,
     require_files,
@@ -243,8 +244,14 @@ class RecordedReference(_Reference):
     """
 
     folder = FilePath(doc="where the files are")
-    files = Text(doc="names of the files (.npz), one for each step, separated by blanks")
-    range0 = Parameter(unit="m", positive=True, doc="slant range of cell 1 of the recording")
+    files = Text(doc="names of the files (.npz, .h5), one for each step, separated by blanks")
+    range0 = Parameter(
+        np.inf,
+        unit="m",
+        positive=True,
+        infinite=True,
+        doc="slant range of cell 1 of the recording; inf: the files'",
+    )
     start_line = Parameter(1.0, doc="line of the recording, fractional, at t = 0")
     band = Parameter(
         [0.0, 1.0], shape=(2,), minimum=0.0, maximum=1.0, doc="part of the Doppler band shown"
@@ -281,7 +288,7 @@ class RecordedReference(_Reference):
         lines = read_lines(self, path, report=True)
         radar = Radar(*map(float, self.radar))
         first_time = (lines.first_line - float(common(self, "start_line"))) / radar.prf - t
-        near = float(common(self, "range0")) + (lines.first_cell - 1) * radar.range_spacing
+        near = near_range(self, lines, radar.sample_rate)
         r, v, q_be, look, squint, band, step, exposure = (
             common(self, name)
             for name in (
@@ -291,11 +298,11 @@ class RecordedReference(_Reference):
         )
         dem = dem_from(self.height, self.grid)
         aligned = np.array([0.0, 0.0, 0.0, 1.0])
-        duration = len(lines.echo) / radar.prf
+        duration = lines.n_lines / radar.prf
         try:
             beam = boresight_on_terrain(r, v, q_be, aligned, float(look), float(squint), dem)
             imager = Imager(
-                lines.echo,
+                lines.read(),
                 radar,
                 near,
                 first_time,

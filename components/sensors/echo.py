@@ -16,9 +16,12 @@ from terrafix.components.fields import ACQUISITION, ECHO, GRID, HEIGHT, RADAR, S
 from terrafix.components.sensors.compiled import row_operations
 from terrafix.components.sensors.files import (
     file_of_step,
+    near_range,
     read_lines,
     recorded_files,
     require_files,
+    sent_by,
+    settled,
 )
 from terrafix.components.shared import common, generator, require_common, shared_setting
 from terrafix.components.truth.terrain import scene_from
@@ -34,7 +37,7 @@ from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.radar.boresight import Boresight, boresight_on_terrain
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.echo import Acquisition, simulated_echo
-from terrafix.models.radar.recording import RecordedLines
+from terrafix.models.radar.recordings.recording import Recording, Sent
 
 _BEYOND = 5.0
 """Arc beyond all apertures [s]: the corners of the surface that is looked up are seen that late."""
@@ -53,11 +56,15 @@ class SendsChirps(Component):
     radar = SharedOutput(**RADAR, doc="what the radar sends and how its echo is sampled")
 
     def _radar(self) -> Radar:
-        values = [shared_setting(self, name) for name in Radar.__dataclass_fields__]
+        values = [self._sends(name) for name in Radar.__dataclass_fields__]
         try:
-            return Radar(*map(float, values))
+            return Radar(*values)
         except ValueError as error:
             raise ConfigurationError(f"the radar of '{self.name}' cannot be: {error}") from error
+
+    def _sends(self, name: str) -> float:
+        """One of the numbers of the radar."""
+        return float(shared_setting(self, name))
 
     def _initialize_impl(self) -> None:
         require_common(self)
@@ -190,32 +197,66 @@ class RecordedEcho(_Echo):
     """Echo that a real radar recorded: one file for each step.
 
     Lines of the recording are numbered; `start_line` is the one received at t = 0. The radar's
-    parameters are those of the recording, and `range0` its slant range of cell 1.
+    parameters are those of the recording, and `range0` its slant range of cell 1: set where the
+    files do not say them (.npz), and left out, or the same, where they do (NISAR L0B).
     """
 
+    carrier = Parameter(
+        np.inf, unit="Hz", positive=True, infinite=True, doc="carrier frequency; inf: the files'"
+    )
+    prf = Parameter(
+        np.inf, unit="Hz", positive=True, infinite=True, doc="pulse repetition; inf: the files'"
+    )
+    sample_rate = Parameter(
+        np.inf, unit="Hz", positive=True, infinite=True, doc="complex samples; inf: the files'"
+    )
+    chirp_rate = Parameter(
+        np.inf, unit="Hz/s", infinite=True, doc="sweep, negative downward; inf: the files'"
+    )
+    pulse_length = Parameter(
+        np.inf, unit="s", positive=True, infinite=True, doc="of the pulse; inf: the files'"
+    )
     folder = FilePath(doc="where the files are")
-    files = Text(doc="names of the files (.npz), one for each step, separated by blanks")
-    range0 = Parameter(unit="m", positive=True, doc="slant range of cell 1 of the recording")
+    files = Text(doc="names of the files (.npz, .h5), one for each step, separated by blanks")
+    range0 = Parameter(
+        np.inf,
+        unit="m",
+        positive=True,
+        infinite=True,
+        doc="slant range of cell 1 of the recording; inf: the files'",
+    )
     start_line = Parameter(1.0, doc="line of the recording, fractional, at t = 0")
 
     def validate(self) -> None:
         """Read the files."""
         self._radar()
         for path in recorded_files(self):
-            read_lines(self, path)
+            self._near_range(read_lines(self, path))
 
     def validate_duration(self, duration: float) -> None:
         """Look whether there is a file for every step, and one that was received then."""
         for t, path in require_files(self, duration):
             self._check_time(read_lines(self, path), path, t)
 
-    def _first_time(self, lines: RecordedLines) -> float:
-        start, prf = (float(shared_setting(self, name)) for name in ("start_line", "prf"))
-        return (lines.first_line - start) / prf
+    def _sends(self, name: str) -> float:
+        value = super()._sends(name)
+        if name not in Sent.__dataclass_fields__:
+            return value
+        told, declared = sent_by(self), self.settings()[name]
+        assert isinstance(declared, Parameter)
+        known = None if told is None else float(getattr(told, name))
+        return settled(self, name, value, known, declared.unit_text())
 
-    def _check_time(self, lines: RecordedLines, path: Path, t: float) -> None:
+    def _near_range(self, lines: Recording) -> float:
+        return near_range(self, lines, self._sends("sample_rate"))
+
+    def _first_time(self, lines: Recording) -> float:
+        start = float(shared_setting(self, "start_line"))
+        return (lines.first_line - start) / self._sends("prf")
+
+    def _check_time(self, lines: Recording, path: Path, t: float) -> None:
         first = self._first_time(lines)
-        last = first + (len(lines.echo) - 1) / float(shared_setting(self, "prf"))
+        last = first + (lines.n_lines - 1) / self._sends("prf")
         if not first <= t <= last:
             raise ConfigurationError(
                 f"'{self.name}' is to publish '{path.name}' at {t:g} s, but its lines were "
@@ -227,6 +268,4 @@ class RecordedEcho(_Echo):
         path = file_of_step(self)
         lines = read_lines(self, path, report=True)
         self._check_time(lines, path, t)
-        near = float(common(self, "range0"))
-        near += (lines.first_cell - 1) * self._radar().range_spacing
-        self._publish(t, lines.echo, self._first_time(lines), near)
+        self._publish(t, lines.read(), self._first_time(lines), self._near_range(lines))

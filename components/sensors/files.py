@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import astuple
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+
+from terrafix.components.shared import shared_setting
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.models.radar.recording import RecordedLines, read_recording
+from terrafix.models.radar.chirp import SPEED_OF_LIGHT
+from terrafix.models.radar.recordings.files import read_recording
+from terrafix.models.radar.recordings.recording import Recording, Sent
 
 _log = logging.getLogger(__name__)
+_ALIKE = 1e-6
+"""How far a setting may be from what a file says, relative to it."""
 
 
-def read_lines(component: Component, path: Path, *, report: bool = False) -> RecordedLines:
-    """Recorded lines in a file of a component; `report` says if some were lost."""
+def read_lines(component: Component, path: Path, *, report: bool = False) -> Recording:
+    """Recording in a file of a component; `report` says if lines were lost."""
     try:
         lines = read_recording(path)
     except (OSError, ValueError) as error:
@@ -26,6 +35,81 @@ def read_lines(component: Component, path: Path, *, report: bool = False) -> Rec
     if report and lines.told():
         _log.warning("'%s' reads '%s': %s", component.name, path.name, lines.told())
     return lines
+
+
+def sent_by(component: Component) -> Sent | None:
+    """What the files of a component say that their radar sends; None if they say nothing.
+
+    Raises
+    ------
+    ConfigurationError
+        If a file cannot be read, or they do not agree.
+    """
+    paths = recorded_files(component)
+    told = [_told(component, path) for path in paths]
+    for path, sent in zip(paths[1:], told[1:], strict=True):
+        if (sent is None) != (told[0] is None) or (sent and told[0] and not _alike(sent, told[0])):
+            raise ConfigurationError(
+                f"'{component.name}' has files of two radars: '{paths[0].name}' says {told[0]}, "
+                f"'{path.name}' {sent}\n  give each radar a component of its own"
+            )
+    return told[0]
+
+
+def _told(component: Component, path: Path) -> Sent | None:
+    if not path.is_file():
+        return read_lines(component, path).sent
+    stat = path.stat()
+    try:
+        return _sent(path, stat.st_mtime_ns, stat.st_size)
+    except (OSError, ValueError):
+        return read_lines(component, path).sent
+
+
+@lru_cache(maxsize=64)
+def _sent(path: Path, _changed: int, _size: int) -> Sent | None:
+    """What a file says of its radar, as long as it stays as it is: files are large."""
+    return read_recording(path).sent
+
+
+def _alike(one: Sent, other: Sent) -> bool:
+    return bool(np.allclose(astuple(one), astuple(other), rtol=_ALIKE, atol=0))
+
+
+def settled(component: Component, name: str, value: float, told: float | None, unit: str) -> float:
+    """A number that a person may set and a file may say: infinite where it is not set.
+
+    Raises
+    ------
+    ConfigurationError
+        If neither says it, or they contradict each other.
+    """
+    if told is None and np.isinf(value):
+        raise ConfigurationError(
+            f"the files of '{component.name}' do not say its {name}\n  set {component.name}.{name}"
+        )
+    if told is None or np.isinf(value):
+        return value if told is None else told
+    if abs(value - told) > _ALIKE * abs(told):
+        raise ConfigurationError(
+            f"'{component.name}.{name}' is {value:.12g} {unit}, but its files say {told:.12g} "
+            f"{unit}\n  leave it out, or name the files of that radar"
+        )
+    return told
+
+
+def near_range(component: Component, lines: Recording, sample_rate: float) -> float:
+    """Slant range of the first cell of a recording [m]: of its file, or of the setting `range0`.
+
+    Raises
+    ------
+    ConfigurationError
+        If neither says it, or they contradict each other.
+    """
+    before = (lines.first_cell - 1) * (SPEED_OF_LIGHT / (2 * sample_rate))
+    told = None if lines.near_range is None else lines.near_range - before
+    value = float(shared_setting(component, "range0"))
+    return settled(component, "range0", value, told, "m") + before
 
 
 def require_files(component: Component, duration: float) -> list[tuple[float, Path]]:

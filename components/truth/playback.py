@@ -189,16 +189,16 @@ def last_step(rate: Rate | None, duration: float) -> float:
 class RecordedOrbit(Component):
     """A satellite's real or earlier orbit, on the ports of `orbit`.
 
-    From an orbit file of others (OEM, SP3-c, SP3-d, EOF, table), whose states are interpolated to
-    the eighth order, or from a result of terrafix (.nc), played sample by sample. A run begins at
-    the system's epoch, or where it has none `start` after the first state. What a file does not
-    hold is supplied: `delta_v_e` is zero; inertial axes are GCRF in a system with an epoch, else
-    the Earth-fixed ones of t = 0 turned by `earth_angle0`.
+    From an orbit file of others (OEM, SP3-c, SP3-d, EOF, table, NISAR's HDF5), whose states are
+    interpolated to the eighth order, or from a result of terrafix (.nc), played sample by sample.
+    A run begins at the system's epoch, or where it has none `start` after the first state. What a
+    file does not hold is supplied: `delta_v_e` is zero; inertial axes are GCRF in a system with an
+    epoch, else the Earth-fixed ones of t = 0 turned by `earth_angle0`.
     """
 
     default_rate = Rate(hz=100)
 
-    orbit_file = FilePath(doc="orbit file (OEM, SP3, .EOF, .csv) or result (.nc)")
+    orbit_file = FilePath(doc="orbit file (OEM, SP3, .EOF, .csv, .h5) or result (.nc)")
     source = Text("orbit", doc="path of the component whose outputs are played (.nc)")
     satellite = Text("", doc="which, in a file of several (OEM, SP3)")
     start = Parameter(

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from scipy import fft
 from scipy.signal import get_window
 
-from terrafix.models.core.arrays import ComplexArray, FloatArray
+from terrafix.models.core.arrays import ComplexArray, Single
 
 SPEED_OF_LIGHT = 299792458.0
 """Speed of light in vacuum [m/s]."""
@@ -183,19 +183,14 @@ def range_compressed(echo: ComplexArray, radar: Radar, window: Window = "boxcar"
     return np.ascontiguousarray(compressed[:, : echo.shape[1]])
 
 
-def gain_compensated(echo: ComplexArray, attenuation_db: ArrayLike) -> ComplexArray:
-    """Undo the automatic gain control of a receiver.
+def gain_of(attenuation_db: ArrayLike, n_lines: int) -> Single:
+    """Factors (n_lines,) that undo the automatic gain control of a receiver.
 
     Parameters
     ----------
-    echo : ndarray of complex64, shape (n_lines, n_cells)
     attenuation_db : array_like, shape (n_lines,)
-        Attenuation set for each line [dB].
-
-    Returns
-    -------
-    ndarray of complex64, shape (n_lines, n_cells)
-        Echo with the least attenuated line unchanged.
+        Attenuation set for each line [dB]; the echo of the least attenuated line stays.
+    n_lines : int
 
     Raises
     ------
@@ -203,9 +198,8 @@ def gain_compensated(echo: ComplexArray, attenuation_db: ArrayLike) -> ComplexAr
         If there is not one finite attenuation per line.
     """
     db = np.asarray(attenuation_db, dtype=np.float64)
-    if db.shape != echo.shape[:1] or not np.isfinite(db).all():
+    if db.shape != (n_lines,) or not np.isfinite(db).all():
         raise ValueError(
-            f"an echo of {echo.shape[0]} lines wants as many finite attenuations, got {db.shape}"
+            f"an echo of {n_lines} lines wants as many finite attenuations, got {db.shape}"
         )
-    gain: FloatArray = 10 ** ((db - db.min()) / 20)
-    return echo * gain[:, None].astype(np.float32)
+    return np.asarray(10 ** ((db - db.min()) / 20), np.float32)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from terrafix.models.core.formats import kind_of
+from terrafix.models.core.formats import HDF5, kind_of
 from terrafix.models.motion.ephemeris import Ephemeris, read_eof
+from terrafix.models.motion.orbits.hdf5 import read_hdf5
 from terrafix.models.motion.orbits.oem import read_oem
 from terrafix.models.motion.orbits.sp3 import read_sp3
 from terrafix.models.motion.orbits.table import read_table
 
-FORMATS = "OEM, SP3-c, SP3-d, EOF, or a table (.csv)"
+FORMATS = "OEM, SP3-c, SP3-d, EOF, a table (.csv), or a NISAR product (HDF5)"
 OF_MANY = ("oem", "sp3")
 """Formats that may hold several satellites."""
 
 
 def format_of(path: Path) -> str:
-    """What format a file is in: "oem", "sp3", "eof" or "table".
+    """What format a file is in: "oem", "sp3", "eof", "hdf5" or "table".
 
     Raises
     ------
@@ -38,11 +39,13 @@ def format_of(path: Path) -> str:
     if path.suffix.lower() == ".csv":
         return "table"
     found, _ = kind_of(path)
+    if found == HDF5:
+        return "hdf5"
     raise ValueError(f"it is {found or 'of a kind that is not known'}; read are {FORMATS}")
 
 
 def read_orbit(path: str | Path, satellite: str = "") -> Ephemeris:
-    """Read an orbit file: OEM, SP3-c or SP3-d, EOF, or a table (.csv).
+    """Read an orbit file: OEM, SP3-c or SP3-d, EOF, a table (.csv), or a NISAR product (HDF5).
 
     Parameters
     ----------
@@ -68,6 +71,8 @@ def read_orbit(path: str | Path, satellite: str = "") -> Ephemeris:
             raise ValueError(f"it holds one satellite: '{satellite}' need not be named")
         if kind == "eof":
             return read_eof(path)
+        if kind == "hdf5":
+            return read_hdf5(path)
         if kind == "oem":
             return read_oem(path, satellite).ephemeris()
         return (read_sp3(path, satellite) if kind == "sp3" else read_table(path)).ephemeris()

@@ -75,7 +75,7 @@ class States:
         """
         tags, within = read_tags(self.tags, self.scale)
         t = seconds_since_first(tags, within, self.scale)
-        self._check_distance()
+        check_distance(self.r)
         r, v = to_earth_fixed(self.frame, lambda: atomic(tags, within, self.scale), self.r, self.v)
         first = None
         if self.scale != "UTC":
@@ -85,16 +85,18 @@ class States:
         check_motion(made)
         return made
 
-    def _check_distance(self) -> None:
-        distance = np.linalg.norm(self.r, axis=1)
-        near, far = distance < EARTH.polar_radius, distance > FARTHEST
-        for wrong, where in ((near, "inside the Earth"), (far, "beyond what orbits the Earth")):
-            if wrong.any():
-                k = int(np.argmax(wrong))
-                raise ValueError(
-                    f"state {k} lies {where}, {distance[k]:.6g} m from its center\n"
-                    "  look at the unit of its positions"
-                )
+
+def check_distance(r: FloatArray) -> None:
+    """Raise ValueError if a position (n, 3) [m] is not that of a satellite of the Earth."""
+    distance = np.linalg.norm(r, axis=1)
+    near, far = distance < EARTH.polar_radius, distance > FARTHEST
+    for wrong, where in ((near, "inside the Earth"), (far, "beyond what orbits the Earth")):
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            raise ValueError(
+                f"state {k} lies {where}, {distance[k]:.6g} m from its center\n"
+                "  look at the unit of its positions"
+            )
 
 
 def check_motion(orbit: Ephemeris) -> None:

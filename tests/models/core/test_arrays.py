@@ -15,7 +15,7 @@ from terrafix.models.core.arrays import read_arrays
 from terrafix.models.images.reference import read_reference
 from terrafix.models.maps.dem import read_dem
 from terrafix.models.motion.ephemeris import read_eof
-from terrafix.models.radar.recording import read_recording
+from terrafix.models.radar.recordings.files import read_recording
 
 VALUES = np.arange(12.0).reshape(3, 4)
 WHAT = {
@@ -77,6 +77,7 @@ def test_a_file_of_another_kind_is_named_with_what_to_do(tmp_path, kind, read):
     assert f"it is {what}\n" in text
     assert cure in text
     assert "is a file of NumPy (.npz) with the arrays " in text
+    assert "pickle=" not in text
     assert "allow_pickle" not in text
 
 

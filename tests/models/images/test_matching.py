@@ -12,7 +12,7 @@ from terrafix.models.images.matching import REASONS, Searchable, matched
 from terrafix.models.radar.autofocus import SharpnessCurve, autofocus
 from terrafix.models.radar.doppler import fractional_centroid, unwrapped_centroid
 from terrafix.models.radar.focusing import azimuth_looks, range_doppler
-from terrafix.models.radar.recording import read_recording
+from terrafix.models.radar.recordings.files import read_recording
 
 DATA = Path(os.environ.get("TERRAFIX_DATA", Path(__file__).parents[4] / "shared" / "data"))
 
@@ -224,11 +224,12 @@ def two_looks(name, radar):
     if not file.is_file():
         pytest.skip(f"no real data: {file} is absent (set TERRAFIX_DATA)")
     lines = read_recording(file)
+    echo = lines.read()
     near = 988647.462 + (lines.first_cell - 1) * radar.range_spacing
-    fraction, _ = fractional_centroid(lines.echo, radar.prf)
+    fraction, _ = fractional_centroid(echo, radar.prf)
     centroid = unwrapped_centroid(fraction, radar.prf, -6900.0)
     domain = range_doppler(
-        lines.echo, radar, near_range=near, centroid=centroid, velocity=7062.0
+        echo, radar, near_range=near, centroid=centroid, velocity=7062.0
     ).cropped()
     velocity = autofocus(SharpnessCurve(domain, 2.0), 7062.0).velocity
     return [np.abs(look.valid) for look in azimuth_looks(domain, velocity, 2)]

@@ -19,7 +19,7 @@ from terrafix.models.radar.focusing import azimuth_compressed, range_doppler
 from terrafix.models.radar.footprint import Footprint
 from terrafix.models.radar.imaging import Imager, chip_slices
 from terrafix.models.radar.multilook import detected, full_index, multilook_index
-from terrafix.models.radar.recording import read_recording
+from terrafix.models.radar.recordings.files import read_recording
 from terrafix.models.radar.scene import Scene
 
 V, NEAR = 7062.0, 988647.0
@@ -253,8 +253,10 @@ def test_recorded_lines_are_read_with_their_gain(tmp_path):
     plain = read_recording(recording(tmp_path))
     assert (plain.first_line, plain.first_cell) == (5, 7)
     gained = read_recording(recording(tmp_path, agc_db=np.r_[np.zeros(32), np.full(32, 6.0)]))
-    assert np.abs(gained.echo[32:]) == pytest.approx(np.abs(plain.echo[32:]) * 10**0.3, rel=1e-5)
-    assert gained.echo[:32].tobytes() == plain.echo[:32].tobytes()
+    assert np.abs(gained.read()[32:]) == pytest.approx(
+        np.abs(plain.read()[32:]) * 10**0.3, rel=1e-5
+    )
+    assert gained.read()[:32].tobytes() == plain.read()[:32].tobytes()
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.models.radar.recording import read_recording
+from terrafix.models.radar.recordings.files import read_recording
 
 N, CELLS, FIRST = 300, 512, 41
 
@@ -50,7 +50,7 @@ def test_lost_lines_are_zeros_where_they_were(tmp_path, whole, told):
     found = read_recording(path)
     expected = whole.copy()
     expected[LOST] = 0
-    np.testing.assert_array_equal(found.echo, expected)
+    np.testing.assert_array_equal(found.read(), expected)
     np.testing.assert_array_equal(found.lost, [101, 102, 103, 251])
     assert (found.first_line, found.first_cell) == (FIRST, 7)
     assert found.told().startswith("4 of its 300 lines are lost, the first is line 101")
@@ -66,7 +66,7 @@ def test_a_whole_recording_has_lost_nothing(tmp_path, whole):
     found = read_recording(written(tmp_path, whole, line_number=FIRST + np.arange(N)))
     assert not len(found.lost)
     assert found.told() == ""
-    np.testing.assert_array_equal(found.echo, whole)
+    np.testing.assert_array_equal(found.read(), whole)
 
 
 @pytest.mark.parametrize("n_lost", [1, 2, 10])
@@ -111,7 +111,7 @@ def test_slips_in_real_echo_are_found(tmp_path, data_folder, name):
     path = data_folder / "radarsat1_vancouver" / f"{name}.npz"
     if not path.is_file():
         pytest.skip(f"no {path}")
-    lines, found = read_recording(path).echo, 0
+    lines, found = read_recording(path).read(), 0
     places = range(100, 1400, 100)
     for at in places:
         torn = written(tmp_path, np.delete(lines[at - 90 : at + 100], np.s_[90:100], axis=0))

@@ -1,0 +1,1 @@
+"""Recorded raw echo in the formats that it comes in, read to one interface."""

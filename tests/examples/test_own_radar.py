@@ -1,0 +1,50 @@
+"""The page "bring your own radar": its system runs on ALOS PALSAR's raw echo."""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import terrafix as tf
+from terrafix.cosim.basics.errors import SystemCheckError
+from terrafix.models.radar.doppler import fractional_centroid
+from terrafix.models.radar.recordings.files import read_recording
+
+ROOT = Path(__file__).parents[2]
+DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT / ".." / "shared" / "data"))
+ECHO = DATA / "alos_palsar" / "ALPSRP264757150-H1.0__A_HH_LINE4000-5000_RANGE0-2200.h5"
+
+
+@pytest.fixture
+def system(tmp_path, monkeypatch):
+    if not ECHO.is_file():
+        pytest.skip(f"no real data: {ECHO} is absent (set TERRAFIX_DATA)")
+    monkeypatch.setenv("TERRAFIX_DATA", str(DATA))
+    (block,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs/own_radar.md").read_text(), re.DOTALL)
+    (tmp_path / "palsar.toml").write_text(block)
+    return tf.read_system(tmp_path / "palsar.toml")
+
+
+def test_the_system_of_the_page_hears_what_its_orbit_predicts(system):
+    """Doppler of the beam by the file's orbit, level, against that of the lines' own phases."""
+    data = tf.simulate(system, members=1).dataset
+
+    def acquired(name):
+        values = data[f"echo.acquired.{name}"].values
+        return float(values[np.isfinite(values)][0])
+
+    recording = read_recording(ECHO)
+    found, _ = fractional_centroid(recording.read(), recording.sent.prf)
+    assert acquired("beam_doppler") == pytest.approx(found, abs=2.0)
+    assert acquired("near_range") == 847166.0
+    assert acquired("first_time") == pytest.approx(-0.23, abs=1e-9)
+    # flat ground at 33.5 degrees off nadir, amid 847 to 868 km
+    assert 857e3 < acquired("beam_range") < 860e3
+
+
+def test_a_radar_that_is_not_the_files_is_refused(system):
+    system.nodes["echo"].prf = 2000.0
+    with pytest.raises(SystemCheckError, match=r"'echo.prf' is 2000 Hz, but its files say 2150"):
+        tf.simulate(system, members=1)
