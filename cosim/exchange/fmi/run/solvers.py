@@ -86,14 +86,15 @@ class Integrator:
     def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
         """Handle events at the present time, and what `change` sets in event mode.
 
-        The solver goes on as it was where the equations did not change.
+        Where nothing was set, and states and derivatives stand, the solver goes on as it was. What
+        was set may tell later, and a solver of many steps has looked ahead with what was.
         """
-        before = self._moment()
+        before = self._moment() if change is None else None
         self._fmu.call("EnterEventMode")
         if change is not None:
             change()
         self._events(t)
-        if not np.array_equal(before, self._moment()):
+        if before is None or not np.array_equal(before, self._moment()):
             self.restart(t)
 
     def _moment(self) -> FloatArray:

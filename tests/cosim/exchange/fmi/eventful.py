@@ -281,16 +281,18 @@ STATES</ModelStructure>
 """
 
 
-def strict(path, *, n_states, ends=False, stuck=False):
+def strict(path, *, n_states, ends=False, stuck=False, continuous=False):
     """Write a model that refuses every call that its mode does not allow.
 
-    x' = u with discrete inputs u and b, a time event every 0.25 s, the first wanted from the start;
+    x' = u with discrete inputs u (or a continuous one, which only jumps) and b, a time event every 0.25 s, the first wanted from the start;
     y = (x, number of events, u + 10 b). With `ends`, the second event ends the simulation; with
     `stuck`, time events are asked for again and again.
     """
     states = '<Derivatives><Unknown index="7"/></Derivatives>' if n_states else ""
     defines = f"#define NX {n_states}\n#define ENDS {int(ends)}\n#define STUCK {int(stuck)}\n"
     xml = STRICT_XML.replace("STATES", states)
+    if continuous:
+        xml = xml.replace('"discrete"', '"continuous"', 1)
     return make_fmu(path, STRICT, xml, fmi=2, defines=defines)
 
 

@@ -53,14 +53,16 @@ def driven(file, **options):
 
 
 @pytest.mark.parametrize("solver", ["cvode", "dop853"])
-@pytest.mark.parametrize("n_states", [0, 1])
-def test_discrete_inputs_time_events_and_zero_nominals(tmp_path, solver, n_states):
+@pytest.mark.parametrize(("n_states", "continuous"), [(0, False), (1, False), (1, True)])
+def test_inputs_that_jump_time_events_and_zero_nominals(tmp_path, solver, n_states, continuous):
     """The FMU refuses any call in a mode that FMI 2 does not allow it in.
+
+    Its real input is discrete, or a continuous one, of which FMI makes a jump an event.
 
     At t = 1 s: x = 0.1 (0 + 1 + ... + 9) = 4.5, four events of 0.25 s, and the step began with
     u = 9 and b = 1. The nominal value of x is 0.
     """
-    file = eventful.strict(tmp_path / "strict.fmu", n_states=n_states)
+    file = eventful.strict(tmp_path / "strict.fmu", n_states=n_states, continuous=continuous)
     y = simulate(driven(file, solver=solver), duration="1").dataset["part.y"].values[:, 0]
     assert y[0].tolist() == [0.0, 0.0, 0.0]
     assert y[-1, 1:].tolist() == [4.0, 19.0]
