@@ -148,11 +148,13 @@ _MOST_HEARD = 100
 
 def _note(environment: int | None, status: int, text: bytes | None) -> None:
     said = (text or b"").decode(errors="replace").strip()
+    if not said:
+        return
     found = _messages.setdefault(environment or 0, [])
-    if said and len(found) < 100:
+    if len(found) < _MOST_HEARD:
         found.append(said)
     heard = HEARD.setdefault(environment or 0, [])
-    if said and len(heard) < _MOST_HEARD:
+    if len(heard) < _MOST_HEARD:
         heard.append((int(status), said))
         ANY_HEARD.value = 1
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes as ct
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +28,10 @@ def _as_nominal(values: FloatArray) -> FloatArray:
 def _changed(before: FloatArray, after: FloatArray) -> bool:
     """Whether an indicator whose side is known is on the other one (FMI: > 0, or not)."""
     return bool(((before != 0.0) & ((before > 0.0) != (after > 0.0))).any())
+
+
+def _failed(said: str) -> FmuError:
+    return FmuError(f"the solver failed ({said}); another solver, tolerance or step may do")
 
 
 class _NoInput:
@@ -146,7 +151,8 @@ class Integrator:
                             f"it asks for event after event at t = {t:.9g} s: time stands still"
                         )
         except RuntimeError as error:  # of FMPy's CVode
-            raise FmuError(f"the solver failed: {error}") from error
+            said = re.sub(r", function \S+: ", ": ", str(error))  # of the machine that built it
+            raise _failed(f"CVode, {said}") from error
 
     def _integrate(self, t: float, stop: float) -> tuple[bool, float]:
         if self._cvode is not None:
@@ -172,7 +178,7 @@ class Integrator:
         while solver.status == "running":
             message = solver.step()
             if solver.status == "failed":
-                raise FmuError(f"the solver failed: {message}")
+                raise _failed(f"DOP853, {message}")
             if self._n_indicators:
                 path = solver.dense_output()
                 at = self._first_change(solver.t_old, solver.t, path, signs)

@@ -147,6 +147,15 @@ def test_model_exchange_against_the_closed_form(spring, fmi, solver, error):
     assert x == pytest.approx(rest + (0.3 - rest) * np.cos(3 * w), abs=error)
 
 
+def test_a_solver_that_fails_says_what_may_help(spring):
+    """Five digits more than a double has."""
+    fmu = Fmu(file=spring(2), kind=MODEL_EXCHANGE, tolerance=1e-20, rate=Rate("0.1"))
+    message = r"the solver failed \(CVode, .*\); another solver, tolerance or step may do"
+    with pytest.raises(StepError, match=message) as error:
+        outputs(alone(fmu), "1", "part.x")
+    assert "/home" not in str(error.value)
+
+
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_model_exchange_of_an_input_that_moves(tmp_path, fmi):
     """x' = u, x(0) = 1, u held over steps of 0.1 s: x(5) = 1 + 0.1 (u_0 + ... + u_49).

@@ -272,6 +272,8 @@ def test_a_step_size_is_asked_for_by_name(tmp_path, fmus, capsys):
     assert [float(made.nodes[n].rate.period) for n in "ab"] == [0.1, 0.5]
     code, said = run("check", file, "--rate", "10Hz", "--rate", "c=5Hz")
     assert (code, "--rate names 'c', which is no component" in said.err) == (2, True)
+    code, said = run("check", file, "--rate", "10Hz", "--rate", "a=5Hz", "--rate", "b=5Hz")
+    assert (code, "--rate without a name does nothing" in said.err) == (2, True)
     code, said = run("check", file, "--rate", "a=fast")
     assert (code, "--rate a=fast" in said.err) == (2, True)
     target = tmp_path / "x.toml"
