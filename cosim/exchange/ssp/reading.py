@@ -39,6 +39,7 @@ from terrafix.cosim.exchange.ssp.structure import (
     Structure,
     described,
     identifier,
+    set_in_vain,
 )
 from terrafix.cosim.files.choices import Settings
 from terrafix.cosim.files.writing import system_text
@@ -158,6 +159,7 @@ class _Reader:
         self.folder = package.root
         self._rates = rates
         self._without_rate: list[str] = []
+        self._notes: list[str] = []
 
     def system(self, structure: Structure) -> System:
         """A system of what is found in the package."""
@@ -189,7 +191,7 @@ class _Reader:
                 "component a step size\n"
                 f"  name the component: --rate {next(iter(fmus))}=100Hz"
             )
-        system.notes += _lend_units(structure.links, fmus)
+        system.notes += self._notes + _lend_units(structure.links, fmus)
         for name, made in fmus.items():
             system.add(made, name)
         self._connect(system, structure, fmus)
@@ -276,6 +278,9 @@ class _Reader:
                     f"  give it one: --rate {part.name}=100Hz, or --rate 100Hz for all without one"
                 )
             made.start = starts_of(made, part.starts)
+            takes = {n for q in made.settable().values() for n in (q.name, *q.scalars())}
+            if idle := [*(part.starts.keys() - takes - made.interface.texts.keys())]:
+                self._notes.append(set_in_vain(f"'{part.name}'", sorted(idle)))
             made.units = _units(made, part.units)
             made.prepare()
         made.name = ""

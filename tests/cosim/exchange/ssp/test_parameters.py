@@ -281,6 +281,17 @@ def test_a_step_size_is_asked_for_by_name(tmp_path, fmus, capsys):
     assert "0.1" in target.read_text()
 
 
+def test_values_that_nothing_takes_are_told(tmp_path, fmus):
+    """The standard has them ignored; those of `length` and u are taken."""
+    top = system(part("a"), before=bindings(bound(a__kk="1", b__k="1", a__length="2", a__u="3")))
+    file = packaged(tmp_path / "x.ssp", fmus, top)
+    notes = [note for note in check(read_ssp(file)).notes if "nothing" in note]
+    assert notes == [
+        "'a' has nothing that takes the values of 'kk': ignored",
+        "the system has nothing that takes the values of 'b.k': ignored",
+    ]
+
+
 def test_a_package_within_a_package(tmp_path, fmus):
     """What is bound to the component overrules the inner package's own: k 7, not 3."""
     inner = system(
