@@ -203,8 +203,6 @@ class Fleet:
         Rows that are set before and filled after each step.
     drive : Driver or None
         The compiled driver that makes the calls, if there is one.
-    driven : bool
-        Whether there is.
     """
 
     def __init__(self, setup: Setup, n_members: int) -> None:
@@ -235,7 +233,6 @@ class Fleet:
         self._references = {g: references(g.references) for g in (*setup.inputs, *setup.outputs)}
         self.drive: Driver | None = None
         self._call: tuple[Any, Any, Any] | None = None
-        self.driven = False
 
     # ------------------------------------------------------------------ life cycle
 
@@ -387,7 +384,6 @@ class Fleet:
                 written,
             )
             self._call = self.drive.call, self.drive.binding, self.drive.at
-            self.driven = True
         elif all(len(g) <= 1 and all(x.kind in DOUBLE for x in g) for g in groups):
             self._quick = {
                 row: _Quick(instance, self)
