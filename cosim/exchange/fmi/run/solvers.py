@@ -91,23 +91,14 @@ class Integrator:
     def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
         """Handle events at the present time, and what `change` sets in event mode.
 
-        Where nothing was set, and states and derivatives stand, the solver goes on as it was. What
-        was set may tell later, and a solver of many steps has looked ahead with what was.
+        The solver begins anew, whatever states and derivatives are now: equations that differ may
+        tell later, and a solver of many steps has looked ahead with those before.
         """
-        before = self._moment() if change is None else None
         self._fmu.call("EnterEventMode")
         if change is not None:
             change()
         self._events(t)
-        if before is None or not np.array_equal(before, self._moment()):
-            self.restart(t)
-
-    def _moment(self) -> FloatArray:
-        """Continuous states and their derivatives, now."""
-        if not self._n:
-            return np.empty(0)
-        states = self._fmu.get_vector("GetContinuousStates", self._n)
-        return np.concatenate([states, self._fmu.rates(self._n)])
+        self.restart(t)
 
     def restart(self, t: float | None = None) -> None:
         """Begin anew from the present states."""

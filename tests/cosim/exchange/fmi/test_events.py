@@ -70,6 +70,17 @@ def test_inputs_that_jump_time_events_and_zero_nominals(tmp_path, solver, n_stat
     assert y[:, 1].tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4]
 
 
+@pytest.mark.parametrize("solver", ["cvode", "dop853"])
+def test_an_event_of_which_the_derivative_tells_later(tmp_path, solver):
+    """x' = 0 until 0.25 s, then t - 0.25 s: x(2 s) = 1.75^2 / 2. x' itself does not jump."""
+    with System("late") as system:
+        file = eventful.late(tmp_path / "late.fmu")
+        system.add(Fmu(file=file, solver=solver, rate=Rate("0.1")), "part")
+        system.record("history", ["part.y"])
+    y = simulate(system, duration="2").dataset["part.y"].values[-1, 0]
+    assert y[0] == pytest.approx(1.75**2 / 2, abs=1e-8)
+
+
 def test_an_fmu_that_asks_for_an_event_again_and_again(tmp_path):
     file = eventful.strict(tmp_path / "stuck.fmu", n_states=1, stuck=True)
     with pytest.raises(StepError, match=r"event after event at t = 0.25 s: time stands still"):
