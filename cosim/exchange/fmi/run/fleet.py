@@ -60,6 +60,7 @@ def _said(error: FmuError) -> str:
 
 
 _driver = load_driver
+_NEVER = -1  # bits of no number
 _STEP = 2  # of `enum failure` in driver.c
 
 
@@ -313,7 +314,8 @@ class Fleet:
                 self.setup.solver,
                 self.setup.tolerance or MODEL_EXCHANGE_TOLERANCE,
             )
-        self._last[row] = self.inputs[row, self._eventful].view(np.int64)
+        now = self.inputs[row, self._eventful].view(np.int64)
+        self._last[row] = now if known is None else np.full(len(now), _NEVER)
         self._get_all(instance, row)
 
     def _set_starts(self, instance: Instance, row: int, starts: Sequence[Start]) -> None:

@@ -296,6 +296,15 @@ def strict(path, *, n_states, ends=False, stuck=False, continuous=False):
     return make_fmu(path, STRICT, xml, fmi=2, defines=defines)
 
 
+def unset(path):
+    """Write the same with u, which is 5 in the FMU, and of which its description says nothing."""
+    source = STRICT.replace("i->next = 0.25;", "i->next = 1e9, i->u = 5.0;")
+    defines = "#define NX 1\n#define ENDS 0\n#define STUCK 0\n"
+    xml = STRICT_XML.replace("STATES", '<Derivatives><Unknown index="7"/></Derivatives>')
+    xml = xml.replace('"discrete"', '"continuous"', 1).replace('<Real start="0"/>', "<Real/>", 1)
+    return make_fmu(path, source, xml, fmi=2, defines=defines)
+
+
 def late(path):
     """Write the same with one time event at 0.25 s: x' = 0 before it, and t - 0.25 s after."""
     source = STRICT.replace("x[0] = of(c)->u;", "x[0] = of(c)->count ? of(c)->t - 0.25 : 0.0;")

@@ -70,6 +70,17 @@ def test_inputs_that_jump_time_events_and_zero_nominals(tmp_path, solver, n_stat
     assert y[:, 1].tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4]
 
 
+def test_an_input_that_was_not_set_at_the_start_is_set_in_the_first_step(tmp_path):
+    """x' = u, u 5 in the FMU: nothing comes over the delay at the start, and then zeros."""
+    with System("unset") as system:
+        system.add(Stairs(), "stairs")
+        system.add(Fmu(file=eventful.unset(tmp_path / "unset.fmu"), rate=Rate("0.1")), "part")
+        system.connect("stairs.u", "part.u", delay="0.2")
+        system.record("history", ["part.y"])
+    y = simulate(system, duration="0.2").dataset["part.y"].values[:, 0, 0]
+    assert y.tolist() == [0.0, 0.0, 0.0]
+
+
 @pytest.mark.parametrize("solver", ["cvode", "dop853"])
 def test_an_event_of_which_the_derivative_tells_later(tmp_path, solver):
     """x' = 0 until 0.25 s, then t - 0.25 s: x(2 s) = 1.75^2 / 2. x' itself does not jump."""
