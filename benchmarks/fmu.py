@@ -74,7 +74,7 @@ def own(file: Path, *, driver: bool) -> float:
     made.enter(everybody)
     made.leave(everybody)
     fleet._driver = chosen
-    assert made.driven == driver
+    assert (made.drive is not None) == driver
     ticks = [0]
 
     def loop() -> None:

@@ -31,6 +31,7 @@ import zipfile
 from fractions import Fraction
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 from xml.etree import ElementTree
 
@@ -162,22 +163,27 @@ def connectors(archive: str) -> tuple[str, list[tuple[list[str], str, str]]]:
     return str(top.get("name")), found
 
 
+def opened(archive: str) -> Any:
+    """A package as a system, at 1000 Hz where nobody gives a step size."""
+    from terrafix.cosim.exchange.ssp.reading import read_ssp
+
+    try:
+        return read_ssp(archive)
+    except Exception as error:
+        if "--rate" not in str(error):
+            raise
+        return read_ssp(archive, [("rate", "1000 Hz")])
+
+
 def in_terrafix(archive: str, options: dict) -> dict:
     from terrafix.cosim.engine.simulation import Simulation
     from terrafix.cosim.exchange.fmi.run.component import Fmu
     from terrafix.cosim.exchange.ssp.reading import read_ssp
     from terrafix.cosim.exchange.ssp.structure import identifier
 
-    if options["step"] is None:
-        try:
-            system = read_ssp(archive)
-        except Exception as error:
-            if "--rate" not in str(error):
-                raise
-            system = read_ssp(archive, [("rate", "1000 Hz")])
-    else:
-        names = [n for n, c in read_ssp(archive, [("rate", "1 Hz")]).nodes.items()
-                 if isinstance(c, Fmu)]  # fmt: skip
+    system = opened(archive)
+    if options["step"] is not None:
+        names = [n for n, c in system.nodes.items() if isinstance(c, Fmu)]
         system = read_ssp(archive, [(f"{n}.period", f"{options['step']} s") for n in names])
     fmus = {n: c for n, c in system.nodes.items() if isinstance(c, Fmu)}
     for fmu in fmus.values():
@@ -276,7 +282,7 @@ def in_slaves(archive: str, options: dict) -> dict:
     links = []
     lend = reading._lend_units
     reading._lend_units = lambda found, fmus: links.extend(found) or lend(found, fmus)
-    system = reading.read_ssp(archive, [("rate", "1 Hz")])
+    system = opened(archive)
     slaves, known = {}, {}
     for name, fmu in system.nodes.items():
         if not isinstance(fmu, Fmu):

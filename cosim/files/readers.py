@@ -63,7 +63,15 @@ def _reader(path: Path) -> EntryPoint:
     suffix = (path / UNPACKED if (path / UNPACKED).is_file() else path).suffix.lower()
     if suffix not in known:
         if path.is_dir():
-            raise ConfigurationError(f"'{path}' is a folder; name a system file (.toml) in it")
+            raise ConfigurationError(
+                f"'{path}' is a folder without {UNPACKED}; name a system file (.toml) in it"
+            )
+        if suffix == ".fmu":
+            raise ConfigurationError(
+                f"'{path}' is an FMU, which runs as a component of a system\n"
+                f'  [component.NAME] with type = "fmu" and file = "{path.name}" in a .toml file; '
+                f"terrafix check-fmu {path} checks it alone"
+            )
         why = f"no reader takes {suffix} files" if suffix else "its name has no suffix"
         raise ConfigurationError(
             f"cannot tell how to read system file '{path}': {why}\n"

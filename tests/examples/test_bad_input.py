@@ -783,7 +783,8 @@ def test_files_that_are_no_systems_are_refused(tmp_path):
         f"  there is no folder '{tmp_path}/a' either"
     )
     assert refusal(read_system, tmp_path) == (
-        f"ConfigurationError: '{tmp_path}' is a folder; name a system file (.toml) in it"
+        f"ConfigurationError: '{tmp_path}' is a folder without SystemStructure.ssd; "
+        "name a system file (.toml) in it"
     )
     system.write_bytes(b"\x89HDF\r\n\x1a\n\xff\xfe")
     assert refusal(read_system, system) == (

@@ -1,4 +1,4 @@
-"""SSP packages read as systems: anybody's, with FMUs of FMI 2 or 3.
+"""SSP packages read as systems: anybody's, with FMUs that run here.
 
 Scalar connections that join whole ports become one connection of ports; where a package connects
 single elements of an array, the FMU shows its scalars instead. Linear transformations become
@@ -39,6 +39,7 @@ from terrafix.cosim.exchange.ssp.structure import (
     Structure,
     described,
     identifier,
+    set_in_vain,
 )
 from terrafix.cosim.files.choices import Settings
 from terrafix.cosim.files.writing import system_text
@@ -157,6 +158,8 @@ class _Reader:
         self.file, self.root, self.top = package.file, root, top
         self.folder = package.root
         self._rates = rates
+        self._without_rate: list[str] = []
+        self._notes: list[str] = []
 
     def system(self, structure: Structure) -> System:
         """A system of what is found in the package."""
@@ -182,7 +185,13 @@ class _Reader:
                 )
         for part in structure.parts.values():
             fmus[part.name] = self._fmu(part, base, arrays=part.name not in scalars)
-        system.notes += _lend_units(structure.links, fmus)
+        if "" in self._rates and fmus and not self._without_rate:
+            raise ConfigurationError(
+                f"--rate without a name does nothing: '{self.file}' and its FMUs give every "
+                "component a step size\n"
+                f"  name the component: --rate {next(iter(fmus))}=100Hz"
+            )
+        system.notes += self._notes + _lend_units(structure.links, fmus)
         for name, made in fmus.items():
             system.add(made, name)
         self._connect(system, structure, fmus)
@@ -259,14 +268,19 @@ class _Reader:
         made = self._opened(part, arrays=arrays)
         with self._telling(part):
             given = self._rates.get(part.name) or part.rate
-            rate = given or (Rate(base) if base is not None else None) or made.rate
-            made.rate = rate or self._rates.get("")
+            made.rate = given or (Rate(base) if base is not None else None) or made.rate
+            if made.rate is None:
+                made.rate = self._rates.get("")
+                self._without_rate.append(part.name)
             if made.rate is None:
                 raise ConfigurationError(
                     "it has no step size in the package or in its FMU\n"
                     f"  give it one: --rate {part.name}=100Hz, or --rate 100Hz for all without one"
                 )
             made.start = starts_of(made, part.starts)
+            takes = {n for q in made.settable().values() for n in (q.name, *q.scalars())}
+            if idle := [*(part.starts.keys() - takes - made.interface.texts.keys())]:
+                self._notes.append(set_in_vain(f"'{part.name}'", sorted(idle)))
             made.units = _units(made, part.units)
             made.prepare()
         made.name = ""

@@ -29,6 +29,7 @@ from terrafix.cosim.exchange.ssp.parameters import (
 )
 
 MOST_WITHIN = 10
+MOST_NAMED = 5
 PACKAGE, DEFINITION = "application/x-ssp-package", "application/x-ssp-definition"
 VERSIONS = ("1.", "2.0")
 _KINDS = {"any": "auto", "CoSimulation": CO_SIMULATION, "ModelExchange": MODEL_EXCHANGE}
@@ -235,8 +236,7 @@ class Gathering:
                 kinds[names[name], str(connector.get("name"))] = str(connector.get("kind"))
         for connection in _children(system, "Connections", "Connection"):
             into.joints.append(self._joint(connection, key, names, kinds, into))
-        for name, value in self._values(system).items():
-            self._set(into, key, name, value)
+        self._set_all(into, key, self._values(system))
 
     def _gather_within(self, element: ET.Element, key: str, prefix: str, into: Structure) -> None:
         """Gather the system of another package or description, as if it stood here.
@@ -261,8 +261,13 @@ class Gathering:
             self._within.pop()
         finally:
             self._package, self._base, self._units_of = outer
-        for name, value in given.items():
-            self._set(into, key, name, value)
+        self._set_all(into, key, given)
+
+    def _set_all(self, into: Structure, key: str, values: Mapping[str, Value]) -> None:
+        """Set what the bindings of a system give; a note names what nothing has."""
+        idle = [name for name, value in values.items() if not self._set(into, key, name, value)]
+        if idle:
+            self.notes.append(set_in_vain(key.removeprefix("system ") or "the system", idle))
 
     def _inner(self, element: ET.Element, source: str, folder: str) -> ET.Element:
         """The system of the description that a component refers to, which is read from now on."""
@@ -340,8 +345,8 @@ class Gathering:
         name: str,
         value: Value,
         passed: frozenset[End] = frozenset(),
-    ) -> None:
-        """Set what a hierarchical name means.
+    ) -> bool:
+        """Set what a hierarchical name means; whether it means anything.
 
         What comes over a connection overrules what is set at its end, whatever sets it; else what
         is set later overrules what was set before.
@@ -351,14 +356,16 @@ class Gathering:
             if len(passed) >= before:
                 into.parts[owner].starts[name] = value
                 into.steps_to[owner, name] = len(passed)
-            return
+            return True
+        met = False
         for joint in into.joints:
             if joint.source == (owner, name) and joint.target not in passed:
                 there = value.through(joint.step, keep_unit=joint.keep_unit)
-                self._set(into, *joint.target, there, passed | {joint.target})
+                met |= self._set(into, *joint.target, there, passed | {joint.target})
         for element, inner in into.elements.get(owner, {}).items():
             if name.startswith(f"{element}."):  # several may be meant: then all are
-                self._set(into, inner, name[len(element) + 1 :], value, passed)
+                met |= self._set(into, inner, name[len(element) + 1 :], value, passed)
+        return met
 
     def _part(self, name: str, element: ET.Element, rate: ET.Element | None) -> Part:
         kind = element.get("type", "application/x-fmu-sharedlibrary")
@@ -487,6 +494,13 @@ def described(file: Path, name: str, root: ET.Element) -> ET.Element:
         raise ConfigurationError(f"'{file}': {name} describes no system of SSP")
     check_version(file, name, root)
     return top
+
+
+def set_in_vain(where: str, names: Sequence[str]) -> str:
+    """A note of values that are set and that nothing takes, which SSP allows."""
+    shown = [f"'{name}'" for name in names[:MOST_NAMED]]
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{where} has nothing that takes the values of {', '.join(shown)}{more}: ignored"
 
 
 def check_version(file: Path, name: str, root: ET.Element) -> None:

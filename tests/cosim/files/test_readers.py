@@ -69,6 +69,14 @@ def test_an_unknown_suffix_lists_those_that_are_read(tmp_path):
     assert refusal(tmp_path / "coast.tml").endswith(".ssd, .ssp, .toml; did you mean 'coast.toml'?")
 
 
+def test_an_fmu_is_no_system_and_what_to_do_with_it_is_said(tmp_path):
+    assert refusal(tmp_path / "orbit.fmu") == (
+        f"'{tmp_path}/orbit.fmu' is an FMU, which runs as a component of a system\n"
+        '  [component.NAME] with type = "fmu" and file = "orbit.fmu" in a .toml file; '
+        f"terrafix check-fmu {tmp_path}/orbit.fmu checks it alone"
+    )
+
+
 def test_a_name_without_suffix_is_refused_and_the_file_that_was_meant_named(tmp_path):
     said = (
         f"cannot tell how to read system file '{tmp_path}/coast': its name has no suffix\n"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,10 @@ class Report:
     fmi : {2, 3}
     model : str
     kinds : tuple of str
+    version, tool, generated : str
+        Of the model, of its exporter, and when, as its description says (empty: nothing).
+    checked : str
+        When, in UTC.
     checks : list of str
         What was checked.
     findings : list of Finding
@@ -72,6 +77,10 @@ class Report:
     fmi: int
     model: str
     kinds: tuple[str, ...]
+    version: str = ""
+    tool: str = ""
+    generated: str = ""
+    checked: str = field(default_factory=lambda: f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}")
     checks: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     notes: list[Finding] = field(default_factory=list)
@@ -99,6 +108,10 @@ class Report:
             "ok": self.ok,
             "fmi": self.fmi,
             "model": self.model,
+            "version": self.version,
+            "tool": self.tool,
+            "generated": self.generated,
+            "checked": self.checked,
             "kinds": list(self.kinds),
             "checks": self.checks,
             "findings": [f.summary() for f in self.findings],
@@ -131,7 +144,15 @@ def check_fmu(
         MODEL_EXCHANGE: description.modelExchange,
     }
     kinds = [kind for kind, interface in offered.items() if interface is not None]
-    report = Report(Path(path), archive.version, description.modelName or "", tuple(kinds))
+    report = Report(
+        Path(path),
+        archive.version,
+        description.modelName or "",
+        tuple(kinds),
+        description.version or "",
+        description.generationTool or "",
+        description.generationDateAndTime or "",
+    )
     report.checks.append("description")
     for problem in _validated(archive):
         report.add(
@@ -170,11 +191,11 @@ def check_fmu(
                 continue
             if progress is not None:
                 progress(f"{name}, {kind}", number / len(calls))
-            if name not in report.checks:
-                report.checks.append(name)
             fresh = bool(offered[kind].canBeInstantiatedOnlyOncePerProcess)
             try:
                 worker = worker or _fresh(path, kind)
+                if name not in report.checks:
+                    report.checks.append(name)
                 if name == "step size":
                     worker = _wrong_steps(worker, report, kind, once=fresh)
                 else:

@@ -32,6 +32,7 @@ def page(report: Report) -> str:
     worst: dict[str, int] = {}
     for each in found:
         worst[each.check] = max(worst.get(each.check, 0), rank.get(each.severity, 0))
+    looked_at = {*report.checks, *(name for name, found in worst.items() if found)}
     said = ("no finding", "warnings", "breaches")
     return filled(
         _TEMPLATE,
@@ -41,7 +42,7 @@ def page(report: Report) -> str:
         warnings=report.warnings,
         notes=[each for each in report.notes if each not in report.warnings],
         asked=[
-            (name, what, said[worst.get(name, 0)] if name in report.checks else "not checked")
+            (name, what, said[worst.get(name, 0)] if name in looked_at else "not checked")
             for name, what in _ASKED.items()
         ],
     )
@@ -51,13 +52,18 @@ def _facts(report: Report) -> list[tuple[str, Any]]:
     from importlib.metadata import version
 
     called = any(name in report.checks for name in CALLING)
-    return [
+    facts = [
         ("file", report.path),
+        ("version", report.version),
+        ("exported by", report.tool),
+        ("on", report.generated),
         ("FMI", report.fmi),
         ("interfaces", ", ".join(report.kinds)),
         ("called", "yes, in a process of its own" if called else "no"),
         ("checked by", f"terrafix {version('terrafix')}, FMPy {version('fmpy')}"),
+        ("at", report.checked),
     ]
+    return [(term, value) for term, value in facts if value]
 
 
 def write_page(report: Report, target: str | Path) -> Path:

@@ -78,6 +78,14 @@ class FmuEndedError(FmuError):
     """An FMU that ended its simulation, as it may."""
 
 
+def count_standing(before: int, begun: float, t: float) -> int:
+    """Number of events since time went on; too many at one time are an error."""
+    now = 0 if t > begun else before + 1
+    if now > MOST_EVENTS:
+        raise FmuError(f"it asks for event after event at t = {t:.9g} s: time stands still")
+    return now
+
+
 class _Environment(ct.Array[ct.c_longlong]):
     """Room for the C library's ``fenv_t``."""
 
@@ -115,16 +123,6 @@ class Kept:
             os._exit(0)
 
 
-class _Logger2(ct.Structure):
-    _fields_ = (
-        ("logger", ct.c_void_p),
-        ("allocate", ct.c_void_p),
-        ("free", ct.c_void_p),
-        ("finished", ct.c_void_p),
-        ("environment", ct.c_void_p),
-    )
-
-
 class _EventInfo2(ct.Structure):
     _fields_ = (
         ("again", ct.c_int),
@@ -148,11 +146,13 @@ _MOST_HEARD = 100
 
 def _note(environment: int | None, status: int, text: bytes | None) -> None:
     said = (text or b"").decode(errors="replace").strip()
+    if not said:
+        return
     found = _messages.setdefault(environment or 0, [])
-    if said and len(found) < 100:
+    if len(found) < _MOST_HEARD:
         found.append(said)
     heard = HEARD.setdefault(environment or 0, [])
-    if said and len(heard) < _MOST_HEARD:
+    if len(heard) < _MOST_HEARD:
         heard.append((int(status), said))
         ANY_HEARD.value = 1
 
@@ -290,6 +290,7 @@ class Instance:
         From every method whose function does not succeed, with what the FMU said.
     """
 
+    _FREE = "FreeInstance"
     _next = 1
     _start = 0.0
 
@@ -299,9 +300,9 @@ class Instance:
         self.next_event: float | None = None  # in event mode of co-simulation [s]
         self._version = library.version
         self.clocks = Clocks(library.archive.clocks)
-        self._environment = self.environment = Instance._next
+        self.environment = Instance._next
         Instance._next += 1
-        _messages[self._environment] = []
+        _messages[self.environment] = []
         self.pointer: ct.c_void_p | None = None
         function, arguments = self._creation(name)
         function.restype = ct.c_void_p
@@ -320,7 +321,7 @@ class Instance:
         co_simulation = library.kind == CO_SIMULATION
         if self._version == 2:
             function = library["Instantiate"]
-            self._callbacks = callbacks_of_fmi2(self._environment)
+            self._callbacks = callbacks_of_fmi2(self.environment)
             arguments: list[Any] = [
                 name.encode(),
                 int(co_simulation),
@@ -339,13 +340,13 @@ class Instance:
             if co_simulation:
                 arguments += [ct.c_bool(event_mode), ct.c_bool(event_mode)]  # and early return
                 arguments += [None, ct.c_size_t(0)]
-            arguments += [ct.c_void_p(self._environment), _log3]
+            arguments += [ct.c_void_p(self.environment), _log3]
             arguments += [None] if co_simulation else []
         return function, arguments
 
     def said(self) -> str:
         """What the FMU logged since it was last asked, for an error."""
-        found = _messages.get(self._environment, [])
+        found = _messages.get(self.environment, [])
         shown = list(dict.fromkeys(found))[-3:]
         found.clear()
         return ": " + "; ".join(shown) if shown else ""
@@ -418,13 +419,13 @@ class Instance:
     def free(self) -> None:
         """Give the instance back; it cannot be used any more."""
         if self.pointer is not None:
-            function = self.library["FreeInstance"]
+            function = self.library[self._FREE]
             function.restype = None
             with Kept():
                 function(self.pointer)
             self.pointer = None
-        _messages.pop(self._environment, None)
-        HEARD.pop(self._environment, None)
+        _messages.pop(self.environment, None)
+        HEARD.pop(self.environment, None)
 
     # ------------------------------------------------------------------ variables
 
@@ -533,9 +534,7 @@ class Instance:
                 t = last if early and last < stop else stop
             if event or (due is not None and t >= due - tolerance):
                 self.handle(t)
-            standing = 0 if t > begun else standing + 1
-            if standing > MOST_EVENTS:
-                raise FmuError(f"it asks for event after event at t = {t:.9g} s: time stands still")
+            standing = count_standing(standing, begun, t)
 
     def ended(self) -> bool:
         """Whether it ended its simulation with the step that it discarded (FMI 2)."""
@@ -612,7 +611,7 @@ class Instance:
     def discrete_update(self) -> tuple[bool, float | None]:
         """Update discrete states until they stand; (states changed, time of the next event)."""
         changed = False
-        for _ in range(1000):
+        for _ in range(MOST_EVENTS):
             if self._version == 2:
                 info = _EventInfo2()
                 self.call("NewDiscreteStates", ct.byref(info))
@@ -632,7 +631,7 @@ class Instance:
                 raise FmuEndedError(ENDED)
             if not again:
                 return changed, (float(time) if defined else None)
-        raise FmuError("discrete states did not settle in 1000 updates")
+        raise FmuError(f"discrete states did not settle in {MOST_EVENTS} updates")
 
     def set_time(self, t: float) -> None:
         """Set the time [s]."""

@@ -60,6 +60,7 @@ def _said(error: FmuError) -> str:
 
 
 _driver = load_driver
+_NEVER = -1  # bits of no number
 _STEP = 2  # of `enum failure` in driver.c
 
 
@@ -203,8 +204,6 @@ class Fleet:
         Rows that are set before and filled after each step.
     drive : Driver or None
         The compiled driver that makes the calls, if there is one.
-    driven : bool
-        Whether there is.
     """
 
     def __init__(self, setup: Setup, n_members: int) -> None:
@@ -218,19 +217,23 @@ class Fleet:
         self.outputs = np.zeros((n_members, sum(g.size for g in setup.outputs)))
         self.instances: list[Instance | None] = [None] * n_members
         self._integrators: dict[int, Integrator] = {}
-        self._discrete = np.concatenate(
+        exchanged = setup.kind != CO_SIMULATION
+        self._eventful = np.concatenate(  # columns whose change is an event
             [
                 np.arange(0),
-                *(np.arange(g.start, g.start + g.size) for g in setup.inputs if g.discrete),
+                *(
+                    np.arange(g.start, g.start + g.size)
+                    for g in setup.inputs
+                    if g.discrete or exchanged
+                ),
             ]
         )
-        self._last: dict[int, NDArray[np.int64]] = {}  # bits of discrete inputs, as they were set
+        self._last: dict[int, NDArray[np.int64]] = {}  # their bits, as they were set
         self._active = np.zeros(n_members, dtype=np.uint8)
         self._failed = np.zeros(n_members, dtype=np.uint8)
         self._references = {g: references(g.references) for g in (*setup.inputs, *setup.outputs)}
         self.drive: Driver | None = None
         self._call: tuple[Any, Any, Any] | None = None
-        self.driven = False
 
     # ------------------------------------------------------------------ life cycle
 
@@ -311,7 +314,8 @@ class Fleet:
                 self.setup.solver,
                 self.setup.tolerance or MODEL_EXCHANGE_TOLERANCE,
             )
-        self._last[row] = self.inputs[row, self._discrete].view(np.int64)
+        now = self.inputs[row, self._eventful].view(np.int64)
+        self._last[row] = now if known is None else np.full(len(now), _NEVER)
         self._get_all(instance, row)
 
     def _set_starts(self, instance: Instance, row: int, starts: Sequence[Start]) -> None:
@@ -382,7 +386,6 @@ class Fleet:
                 written,
             )
             self._call = self.drive.call, self.drive.binding, self.drive.at
-            self.driven = True
         elif all(len(g) <= 1 and all(x.kind in DOUBLE for x in g) for g in groups):
             self._quick = {
                 row: _Quick(instance, self)
@@ -459,13 +462,14 @@ class Fleet:
             return
         instance = self.instances[row]
         assert instance is not None
-        now = self.inputs[row, self._discrete].view(np.int64)
+        now = self.inputs[row, self._eventful].view(np.int64)
         integrator = self._integrators.get(row)
         if not len(now):
             self._set_all(instance, row)
         elif row in self._last and np.array_equal(now, self._last[row]):
-            self._set_all(instance, row, discrete=(False,))
-        else:  # discrete inputs that changed are set in event mode
+            if integrator is None:
+                self._set_all(instance, row, discrete=(False,))
+        else:  # a jump, as every change is to an integrator; it belongs into event mode
             handle = instance.handle if integrator is None else integrator.handle
             handle(t, lambda: self._set_all(instance, row))
             self._last[row] = now
@@ -530,7 +534,7 @@ class Fleet:
         return self.setup.kind != CO_SIMULATION or self.setup.event_mode
 
     def _events_of(self, row: int) -> bytes:
-        """What a master knows of events: the next time (NaN: none), discrete inputs, clocks."""
+        """What a master knows of events: the next time (NaN: none), inputs, clocks."""
         instance = self.instances[row]
         if not self._handles_events or instance is None:
             return b""
@@ -549,7 +553,7 @@ class Fleet:
         for row, data in enumerate(saved):
             instance = self.instances[row]
             if data and instance is not None:
-                n = len(self._discrete)
+                n = len(self._eventful)
                 size = 8 * (1 + n + 3 * len(instance.clocks)) if self._handles_events else 0
                 events = np.frombuffer(data[:size], np.int64)
                 instance.deserialize(bytes(data[size:]))

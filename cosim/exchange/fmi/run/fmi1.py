@@ -13,7 +13,6 @@ from terrafix.cosim.exchange.fmi.run.binding import (
     SPEAKERS,
     FmuError,
     Instance,
-    Kept,
     Library,
     callbacks_of_fmi2,
 )
@@ -24,6 +23,8 @@ _NO, _YES = ct.c_uint8(0), ct.c_uint8(1)
 
 class InstanceOfFmi1(Instance):
     """One instance of an FMU of FMI 1.0."""
+
+    _FREE = "FreeSlaveInstance"
 
     def __init__(self, library: Library, name: str, *, event_mode: bool = False) -> None:
         super().__init__(library, name, event_mode=event_mode)
@@ -68,15 +69,10 @@ class InstanceOfFmi1(Instance):
 
     def free(self) -> None:
         """Give the instance back; it cannot be used any more."""
-        if self.pointer is not None:
-            function = self.library["FreeSlaveInstance"]
-            function.restype = None
-            with Kept():
-                function(self.pointer)
-            SPEAKERS.pop(self.pointer.value, None)
-            self.pointer = None
-        SPEAKERS.pop(self._name, None)
+        pointer = self.pointer
         super().free()
+        for speaker in (self._name, *([pointer.value] if pointer is not None else [])):
+            SPEAKERS.pop(speaker, None)
 
     def get_state(self, state: ct.c_void_p | None = None) -> ct.c_void_p:
         """FMI 1.0 has none."""

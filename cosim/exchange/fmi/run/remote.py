@@ -239,7 +239,6 @@ class RemoteFleet:
         self.setup = setup
         self.inputs = np.zeros((n_members, sum(g.size for g in setup.inputs)))
         self.outputs = np.zeros((n_members, sum(g.size for g in setup.outputs)))
-        self.driven = False
         self._log: Sequence[tuple[int, int, str]] = ()
         self._limit = limit + FIRST_LIMIT if apart else limit  # each member has `limit`
         self._worker = Worker(MODULE, f"the FMU '{setup.file}'")

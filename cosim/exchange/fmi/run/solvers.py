@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes as ct
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.exchange.fmi.run.archive import Archive
-from terrafix.cosim.exchange.fmi.run.binding import MOST_EVENTS, FmuError, Instance
+from terrafix.cosim.exchange.fmi.run.binding import FmuError, Instance, count_standing
 
 SOLVERS = ("cvode", "dop853")
 _LOOKS = 8  # at the event indicators in a step of dop853
@@ -27,6 +28,10 @@ def _as_nominal(values: FloatArray) -> FloatArray:
 def _changed(before: FloatArray, after: FloatArray) -> bool:
     """Whether an indicator whose side is known is on the other one (FMI: > 0, or not)."""
     return bool(((before != 0.0) & ((before > 0.0) != (after > 0.0))).any())
+
+
+def _failed(said: str) -> FmuError:
+    return FmuError(f"the solver failed ({said}); another solver, tolerance or step may do")
 
 
 class _NoInput:
@@ -86,22 +91,14 @@ class Integrator:
     def handle(self, t: float, change: Callable[[], None] | None = None) -> None:
         """Handle events at the present time, and what `change` sets in event mode.
 
-        The solver goes on as it was where the equations did not change.
+        The solver begins anew, whatever states and derivatives are now: equations that differ may
+        tell later, and a solver of many steps has looked ahead with those before.
         """
-        before = self._moment()
         self._fmu.call("EnterEventMode")
         if change is not None:
             change()
         self._events(t)
-        if not np.array_equal(before, self._moment()):
-            self.restart(t)
-
-    def _moment(self) -> FloatArray:
-        """Continuous states and their derivatives, now."""
-        if not self._n:
-            return np.empty(0)
-        states = self._fmu.get_vector("GetContinuousStates", self._n)
-        return np.concatenate([states, self._fmu.rates(self._n)])
+        self.restart(t)
 
     def restart(self, t: float | None = None) -> None:
         """Begin anew from the present states."""
@@ -126,7 +123,7 @@ class Integrator:
         if self._stale and self._cvode is not None:
             self._cvode.reset(t)
             self._stale = False
-        handled = 0
+        standing = 0
         try:
             while t < end:
                 begun = t
@@ -139,13 +136,10 @@ class Integrator:
                 step_event = self._fmu.completed_step()
                 if state_event or step_event or (due and t >= stop):
                     self.handle(t)
-                    handled = 0 if t > begun else handled + 1
-                    if handled > MOST_EVENTS:
-                        raise FmuError(
-                            f"it asks for event after event at t = {t:.9g} s: time stands still"
-                        )
+                    standing = count_standing(standing, begun, t)
         except RuntimeError as error:  # of FMPy's CVode
-            raise FmuError(f"the solver failed: {error}") from error
+            said = re.sub(r", function \S+: ", ": ", str(error))  # of the machine that built it
+            raise _failed(f"CVode, {said}") from error
 
     def _integrate(self, t: float, stop: float) -> tuple[bool, float]:
         if self._cvode is not None:
@@ -171,7 +165,7 @@ class Integrator:
         while solver.status == "running":
             message = solver.step()
             if solver.status == "failed":
-                raise FmuError(f"the solver failed: {message}")
+                raise _failed(f"DOP853, {message}")
             if self._n_indicators:
                 path = solver.dense_output()
                 at = self._first_change(solver.t_old, solver.t, path, signs)

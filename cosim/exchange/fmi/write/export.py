@@ -37,7 +37,7 @@ from terrafix.cosim.memory.slots import BundleView
 from terrafix.cosim.system.check import Plan, check
 from terrafix.cosim.system.system import System
 
-Starts = Mapping[str, Mapping[str, Any]]
+Starts = Mapping[str, Any]
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same system gives the same file
 
 
@@ -101,8 +101,9 @@ def export_fmu(
     platforms : str
         ``"host"``, ``"all"``, or names from `terrafix.cosim.exchange.fmi.write.binaries.PLATFORMS`.
     start : mapping, optional
-        Start values of inputs, ``{"r_e": {"": [7e6, 0, 0]}}`` by port and field; for a component
-        of a system, instead of what it reads there at t = 0.
+        Start values of inputs by port, ``{"r_e": [7e6, 0, 0]}``, and by field where it has
+        several, ``{"fix": {"z": ...}}``; for a component of a system, instead of what it reads
+        there at t = 0.
     name : str, optional
         Name of the model.
     scalars : bool
@@ -234,7 +235,7 @@ def _refuse_unfinished_start(layout: Layout) -> None:
         f"'{layout.source.name}' is not finite at its start with the start values of its inputs "
         f"({', '.join(inputs)})\n"
         '  export it as a component of a system, which gives them, or pass start={"'
-        f'{inputs[0] if inputs else "port"}": {{"": [...]}}}}'
+        f'{inputs[0] if inputs else "port"}": [...]}}'
     )
 
 
@@ -287,10 +288,15 @@ def source_of(
         path = what.name or _lower(type(what).__name__)
         if what.rate is None:
             raise ConfigurationError(f"'{path}' has no rate\n  give it one: rate=Rate(hz=100)")
-        given = {f"{path}.{port}": fields for port, fields in (start or {}).items()}
+        given = {f"{path}.{port}": v for port, v in _starts(what, path, start or {}).items()}
         return Source.of_component(what, path=path, start=given)
     plan = check(what, outside=True)
     if component is None:
+        if start is not None:
+            raise ConfigurationError(
+                "start does nothing with a whole system: its components give start values\n"
+                "  leave it out, or name a component"
+            )
         return _whole(what, plan)
     if component not in plan.flat.components:
         raise ConfigurationError(
@@ -300,7 +306,9 @@ def source_of(
     chosen = plan.flat.components[component]
     _symbolic(component, chosen)
     assert isinstance(chosen, SymbolicComponent)
-    read = start_values(what, plan, component) if start is None else start
+    read = (
+        start_values(what, plan, component) if start is None else _starts(chosen, component, start)
+    )
     return Source.of_component(
         chosen,
         path=component,
@@ -310,6 +318,32 @@ def source_of(
         seed=what.seed,
         duration=what.duration,
     )
+
+
+def _starts(component: Component, path: str, start: Starts) -> dict[str, dict[str, Any]]:
+    """Start values of inputs, by port and field; of a port with one, the value may stand alone."""
+    found = {}
+    for name, given in start.items():
+        port = component.inputs().get(name)
+        if port is None:
+            raise ConfigurationError(
+                f"start names '{name}', but '{path}' has no such input\n"
+                f"  {nearest(name, component.inputs(), what='inputs')}"
+            )
+        fields = dict(given) if isinstance(given, Mapping) else {"": given}
+        for field, value in fields.items():
+            if field not in port.fields:
+                raise ConfigurationError(
+                    f"start of '{path}.{name}' has no field '{field}'\n"
+                    f"  it takes {{{', '.join(repr(f) + ': ...' for f in port.fields)}}}"
+                )
+            shape = port.fields[field].fixed_shape
+            if np.shape(value) not in ((), shape):
+                raise ConfigurationError(
+                    f"start of '{path}.{name}' has shape {np.shape(value)}; it takes {shape}"
+                )
+        found[name] = fields
+    return found
 
 
 def _whole(system: System, plan: Plan) -> Source:

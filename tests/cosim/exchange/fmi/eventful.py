@@ -281,17 +281,37 @@ STATES</ModelStructure>
 """
 
 
-def strict(path, *, n_states, ends=False, stuck=False):
+def strict(path, *, n_states, ends=False, stuck=False, continuous=False):
     """Write a model that refuses every call that its mode does not allow.
 
-    x' = u with discrete inputs u and b, a time event every 0.25 s, the first wanted from the start;
+    x' = u with discrete inputs u (or a continuous one, which only jumps) and b, a time event every 0.25 s, the first wanted from the start;
     y = (x, number of events, u + 10 b). With `ends`, the second event ends the simulation; with
     `stuck`, time events are asked for again and again.
     """
     states = '<Derivatives><Unknown index="7"/></Derivatives>' if n_states else ""
     defines = f"#define NX {n_states}\n#define ENDS {int(ends)}\n#define STUCK {int(stuck)}\n"
     xml = STRICT_XML.replace("STATES", states)
+    if continuous:
+        xml = xml.replace('"discrete"', '"continuous"', 1)
     return make_fmu(path, STRICT, xml, fmi=2, defines=defines)
+
+
+def unset(path):
+    """Write the same with u, which is 5 in the FMU, and of which its description says nothing."""
+    source = STRICT.replace("i->next = 0.25;", "i->next = 1e9, i->u = 5.0;")
+    defines = "#define NX 1\n#define ENDS 0\n#define STUCK 0\n"
+    xml = STRICT_XML.replace("STATES", '<Derivatives><Unknown index="7"/></Derivatives>')
+    xml = xml.replace('"discrete"', '"continuous"', 1).replace('<Real start="0"/>', "<Real/>", 1)
+    return make_fmu(path, source, xml, fmi=2, defines=defines)
+
+
+def late(path):
+    """Write the same with one time event at 0.25 s: x' = 0 before it, and t - 0.25 s after."""
+    source = STRICT.replace("x[0] = of(c)->u;", "x[0] = of(c)->count ? of(c)->t - 0.25 : 0.0;")
+    source = source.replace("i->next += 0.25", "i->next += 1e9")
+    defines = "#define NX 1\n#define ENDS 0\n#define STUCK 0\n"
+    xml = STRICT_XML.replace("STATES", '<Derivatives><Unknown index="7"/></Derivatives>')
+    return make_fmu(path, source, xml, fmi=2, defines=defines)
 
 
 # ------------------------------------------------------------------ a bouncing ball, FMI 2

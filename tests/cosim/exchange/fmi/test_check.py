@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 import zipfile
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import fmpy
@@ -289,6 +290,20 @@ def test_no_binary_for_this_machine_is_no_breach(tmp_path):
     notes = [n.what for n in report.notes if n.check == "run"]
     assert notes == ["it was not called: it has no binary for this machine, linux64; it has win64"]
     assert "not checked" in page(report)
+    assert "<dt>called</dt><dd>no</dd>" in page(report)
+
+
+def test_a_binary_that_cannot_be_loaded_was_not_called(tmp_path):
+    """It is an ELF file that ends in its header."""
+    platform = host_platform()
+    stub = f"binaries/{platform.folder(2)}/small{platform.suffix}", b"\x7fELF" + bytes(16)
+    file = repacked(
+        small_fmu(tmp_path / "a.fmu", 2, [U, Y]), tmp_path / "b.fmu",
+        lambda name: name.replace("binaries", "elsewhere"), more=[stub],
+    )  # fmt: skip
+    report = check_fmu(file)
+    assert not {"start", "run"} & {*report.checks}
+    assert "<dt>called</dt><dd>no</dd>" in page(report)
 
 
 def test_libraries_that_lie_beside_the_binary_need_no_functions_of_fmi(tmp_path):
@@ -397,13 +412,26 @@ def test_the_page(tmp_path, capsys):
     file = repacked(
         small_fmu(tmp_path / "a.fmu", 2, [U, Y]), tmp_path / "b.fmu",
         lambda n: n.replace("small.", "other."),
-        lambda text: text.replace('modelName="small"', 'modelName="&lt;script&gt;"'),
+        lambda text: text.replace(
+            'modelName="small"',
+            'modelName="&lt;script&gt;" version="1.2" generationTool="a tool" '
+            'generationDateAndTime="2026-11-28T12:00:00Z"',
+        ),
     )  # fmt: skip
     with pytest.raises(SystemExit) as done:
         main(["check-fmu", str(file), "--page", str(tmp_path / "p.html"), "--json"])
     assert done.value.code == 1
     said = json.loads(capsys.readouterr().out)
     text = (tmp_path / "p.html").read_text()
+    for term, value in (
+        ("version", "1.2"),
+        ("exported by", "a tool"),
+        ("on", "2026-11-28T12:00:00Z"),
+        ("at", said["checked"]),
+    ):
+        assert f"<dt>{term}</dt><dd>{value}</dd>" in text
+    assert "://" not in text
+    assert abs(datetime.now(UTC) - datetime.fromisoformat(said["checked"])) < timedelta(minutes=5)
     assert "<h1>&lt;script&gt;</h1>" in text
     assert "<script>" not in text
     assert f"<b>{len(said['findings'])} breach" in text

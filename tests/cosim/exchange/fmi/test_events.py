@@ -53,19 +53,43 @@ def driven(file, **options):
 
 
 @pytest.mark.parametrize("solver", ["cvode", "dop853"])
-@pytest.mark.parametrize("n_states", [0, 1])
-def test_discrete_inputs_time_events_and_zero_nominals(tmp_path, solver, n_states):
+@pytest.mark.parametrize(("n_states", "continuous"), [(0, False), (1, False), (1, True)])
+def test_inputs_that_jump_time_events_and_zero_nominals(tmp_path, solver, n_states, continuous):
     """The FMU refuses any call in a mode that FMI 2 does not allow it in.
+
+    Its real input is discrete, or a continuous one, of which FMI makes a jump an event.
 
     At t = 1 s: x = 0.1 (0 + 1 + ... + 9) = 4.5, four events of 0.25 s, and the step began with
     u = 9 and b = 1. The nominal value of x is 0.
     """
-    file = eventful.strict(tmp_path / "strict.fmu", n_states=n_states)
+    file = eventful.strict(tmp_path / "strict.fmu", n_states=n_states, continuous=continuous)
     y = simulate(driven(file, solver=solver), duration="1").dataset["part.y"].values[:, 0]
     assert y[0].tolist() == [0.0, 0.0, 0.0]
     assert y[-1, 1:].tolist() == [4.0, 19.0]
     assert y[-1, 0] == pytest.approx(4.5 if n_states else 0.0, abs=1e-9)
     assert y[:, 1].tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4]
+
+
+def test_an_input_that_was_not_set_at_the_start_is_set_in_the_first_step(tmp_path):
+    """x' = u, u 5 in the FMU: nothing comes over the delay at the start, and then zeros."""
+    with System("unset") as system:
+        system.add(Stairs(), "stairs")
+        system.add(Fmu(file=eventful.unset(tmp_path / "unset.fmu"), rate=Rate("0.1")), "part")
+        system.connect("stairs.u", "part.u", delay="0.2")
+        system.record("history", ["part.y"])
+    y = simulate(system, duration="0.2").dataset["part.y"].values[:, 0, 0]
+    assert y.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("solver", ["cvode", "dop853"])
+def test_an_event_of_which_the_derivative_tells_later(tmp_path, solver):
+    """x' = 0 until 0.25 s, then t - 0.25 s: x(2 s) = 1.75^2 / 2. x' itself does not jump."""
+    with System("late") as system:
+        file = eventful.late(tmp_path / "late.fmu")
+        system.add(Fmu(file=file, solver=solver, rate=Rate("0.1")), "part")
+        system.record("history", ["part.y"])
+    y = simulate(system, duration="2").dataset["part.y"].values[-1, 0]
+    assert y[0] == pytest.approx(1.75**2 / 2, abs=1e-8)
 
 
 def test_an_fmu_that_asks_for_an_event_again_and_again(tmp_path):

@@ -680,9 +680,29 @@ def test_a_component_alone_needs_start_values_to_start(tmp_path):
         ConfigurationError, match=r"not finite at its start .*\(r_e, v_e, delta_v_e\)"
     ):
         export_fmu(LvlhAttitude(), tmp_path / "x.fmu")
-    start = {"r_e": {"": [7e6, 0, 0]}, "v_e": {"": [0, 7.5e3, 0]}}
+    start = {"r_e": [7e6, 0, 0], "v_e": {"": [0, 7.5e3, 0]}}
     made = export_fmu(LvlhAttitude(), tmp_path / "x.fmu", start=start)
     assert made.model == "lvlh_attitude"
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        ({"forces": 1.0}, r"start names 'forces', but 'spring' has no such input\n .*'force'"),
+        ({"force": {"x": 1.0}}, r"start of 'spring.force' has no field 'x'\n  it takes {'': ...}"),
+        ({"force": [1.0, 2.0]}, r"start of 'spring.force' has shape \(2,\); it takes \(\)"),
+    ],
+)
+def test_start_values_of_nothing_are_refused(tmp_path, start, message):
+    with pytest.raises(ConfigurationError, match=message):
+        export_fmu(fmu_parts.Spring(), tmp_path / "x.fmu", start=start)
+
+
+def test_a_whole_system_takes_no_start_values(tmp_path):
+    with System("whole") as system:
+        system.expose("x", system.add(fmu_parts.Spring(), "spring")["x"])
+    with pytest.raises(ConfigurationError, match=r"start does nothing with a whole system"):
+        export_fmu(system, tmp_path / "x.fmu", start={"force": 1.0})
 
 
 def test_a_delay_is_not_exported(tmp_path):

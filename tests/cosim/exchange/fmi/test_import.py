@@ -147,6 +147,37 @@ def test_model_exchange_against_the_closed_form(spring, fmi, solver, error):
     assert x == pytest.approx(rest + (0.3 - rest) * np.cos(3 * w), abs=error)
 
 
+def test_a_solver_that_fails_says_what_may_help(spring):
+    """Five digits more than a double has."""
+    fmu = Fmu(file=spring(2), kind=MODEL_EXCHANGE, tolerance=1e-20, rate=Rate("0.1"))
+    message = r"the solver failed \(CVode, .*\); another solver, tolerance or step may do"
+    with pytest.raises(StepError, match=message) as error:
+        outputs(alone(fmu), "1", "part.x")
+    assert "/home" not in str(error.value)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_model_exchange_of_an_input_that_moves(tmp_path, fmi):
+    """x' = u, x(0) = 1, u held over steps of 0.1 s: x(5) = 1 + 0.1 (u_0 + ... + u_49).
+
+    A solver of many steps has looked ahead with the input that was.
+    """
+    file = tmp_path / "own.fmu"
+    export_fmu(fmu_parts.Own(), file, fmi=fmi)
+    with System("moving") as system:
+        source = system.add(fmu_parts.Turning(), "source")
+        for solver in ("cvode", "dop853"):
+            part = system.add(
+                Fmu(file=file, kind=MODEL_EXCHANGE, solver=solver, rate=Rate("0.1")), solver
+            )
+            system.connect(source["x"], part["u"])
+        system.record("all", ["source.x", "cvode.x", "dop853.x"])
+    found = simulate(system, duration="5").dataset
+    expected = 1.0 + 0.1 * found["source.x"].values[:-1].sum()
+    for solver in ("cvode", "dop853"):
+        assert found[f"{solver}.x"].values[-1, 0] == pytest.approx(expected, abs=1e-12)
+
+
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_time_in_a_derivative_is_the_same_here_and_in_either_kind(tmp_path, fmi):
     """x' = cos t to t = 10 s at 10 Hz: Simpson's rule here and in co-simulation, sin 10 in all.

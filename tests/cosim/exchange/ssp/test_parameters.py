@@ -272,11 +272,24 @@ def test_a_step_size_is_asked_for_by_name(tmp_path, fmus, capsys):
     assert [float(made.nodes[n].rate.period) for n in "ab"] == [0.1, 0.5]
     code, said = run("check", file, "--rate", "10Hz", "--rate", "c=5Hz")
     assert (code, "--rate names 'c', which is no component" in said.err) == (2, True)
+    code, said = run("check", file, "--rate", "10Hz", "--rate", "a=5Hz", "--rate", "b=5Hz")
+    assert (code, "--rate without a name does nothing" in said.err) == (2, True)
     code, said = run("check", file, "--rate", "a=fast")
     assert (code, "--rate a=fast" in said.err) == (2, True)
     target = tmp_path / "x.toml"
     assert run("ssp", "import", file, "--rate", "0.1s", "-o", target)[0] == 0
     assert "0.1" in target.read_text()
+
+
+def test_values_that_nothing_takes_are_told(tmp_path, fmus):
+    """The standard has them ignored; those of `length` and u are taken."""
+    top = system(part("a"), before=bindings(bound(a__kk="1", b__k="1", a__length="2", a__u="3")))
+    file = packaged(tmp_path / "x.ssp", fmus, top)
+    notes = [note for note in check(read_ssp(file)).notes if "nothing" in note]
+    assert notes == [
+        "'a' has nothing that takes the values of 'kk': ignored",
+        "the system has nothing that takes the values of 'b.k': ignored",
+    ]
 
 
 def test_a_package_within_a_package(tmp_path, fmus):
