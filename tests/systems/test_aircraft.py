@@ -56,6 +56,7 @@ def flight():
     return Flown(RADAR)
 
 
+@pytest.mark.campaign
 def test_errors_are_those_of_the_notes(flight):
     """At 50 s, 3 sigma: at most 3 m north and 3.3 m east and down, and as linear covariance has it.
 

@@ -27,6 +27,7 @@ def seen(outline):
     return flown(outline)
 
 
+@pytest.mark.campaign
 def test_moments_of_images_are_those_of_the_outline_within_their_noise(outline, seen):
     """Against the contour's own moments, of the same members: 5 by 7 images, six each."""
     told = [("lakes.file", str(outline)), ("case", "T1"), *EVERY]

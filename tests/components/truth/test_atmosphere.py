@@ -5,6 +5,7 @@ import pymsis
 import pytest
 
 from terrafix.components.truth.atmosphere import Atmosphere
+from terrafix.components.truth.environment import SpaceEnvironment
 from terrafix.components.truth.satellite_orbit import SatelliteOrbit
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import SystemCheckError
@@ -61,11 +62,11 @@ def test_it_holds_until_the_next_publication():
 def falling(epoch="2022-09-18T07:49:21 UTC"):
     system = System("falling", duration="60 s", epoch=epoch)
     begin = {"start_from": "parameters", "r0_e": R_E, "v0_e": V_E, "gravity": "j2"}
-    orbit = system.add(
-        SatelliteOrbit(rate=Rate(hz=10), drag="atmosphere", ballistic_coefficient=0.02, **begin),
-        "orbit",
-    )
     air = system.add(Atmosphere(**ACTIVITY), "air")
+    begin |= {"surrounded": True, "drag": "atmosphere", "ballistic_coefficient": 0.02}
+    orbit = system.add(SatelliteOrbit(rate=Rate(hz=10), **begin), "orbit")
+    sky = system.add(SpaceEnvironment(), "sky")
+    system.connect(sky["surroundings"], orbit["surroundings"])
     system.connect(orbit["r_e"], air["r_e"])
     system.connect(air["air"], orbit["atmosphere"])
     system.record("all", ["orbit.delta_v_e", "orbit.r_e"])

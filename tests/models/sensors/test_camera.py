@@ -230,6 +230,7 @@ def test_derivatives_are_those_of_differences(trial, law):
     np.testing.assert_allclose(H / scale, numeric / scale, atol=1e-6)
 
 
+@pytest.mark.campaign
 def test_the_factor_of_an_outline_is_that_of_vertices_that_are_drawn():
     """Of moments of 20,000 outlines off by 1 m; for a smooth ellipse 30 m are not small."""
     points, told = ellipse(), given() | catalog(ellipse())

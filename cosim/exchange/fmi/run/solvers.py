@@ -34,6 +34,15 @@ def _failed(said: str) -> FmuError:
     return FmuError(f"the solver failed ({said}); another solver, tolerance or step may do")
 
 
+def stop_at(solver: Any, t: float) -> None:
+    """Forbid FMPy's CVode to look beyond a time [s]."""
+    from fmpy.sundials.libraries import sundials_cvode
+
+    forbid = sundials_cvode.CVodeSetStopTime
+    forbid.argtypes, forbid.restype = [ct.c_void_p, ct.c_double], ct.c_int
+    forbid(solver.cvode_mem, t)
+
+
 class _NoInput:
     """Inputs are set before a step and stand still during it."""
 
@@ -92,13 +101,24 @@ class Integrator:
         """Handle events at the present time, and what `change` sets in event mode.
 
         The solver begins anew, whatever states and derivatives are now: equations that differ may
-        tell later, and a solver of many steps has looked ahead with those before.
+        tell later, and a solver of many steps has looked ahead with those before. It goes on where
+        it was told the time of the event, and has not looked beyond, if nothing was set and states
+        and derivatives stand.
         """
+        before = self._moment() if change is None and self._not_beyond == t else None
         self._fmu.call("EnterEventMode")
         if change is not None:
             change()
         self._events(t)
-        self.restart(t)
+        if before is None or not np.array_equal(before, self._moment()):
+            self.restart(t)
+
+    def _moment(self) -> FloatArray:
+        """Continuous states and their derivatives, now."""
+        if not self._n:
+            return np.empty(0)
+        states = self._fmu.get_vector("GetContinuousStates", self._n)
+        return np.concatenate([states, self._fmu.rates(self._n)])
 
     def restart(self, t: float | None = None) -> None:
         """Begin anew from the present states."""
@@ -108,6 +128,8 @@ class Integrator:
             self._stale = True
 
     _stale = False
+    _not_beyond: float | None = None
+    """Where the solver stands, if it was told to stop there [s]."""
 
     def advance(self, t: float, h: float) -> None:
         """Integrate from `t` over `h` [s].
@@ -142,10 +164,19 @@ class Integrator:
             raise _failed(f"CVode, {said}") from error
 
     def _integrate(self, t: float, stop: float) -> tuple[bool, float]:
+        self._not_beyond = None
         if self._cvode is not None:
-            event, _, t = self._cvode.step(t, stop)
+            due = self.next_event
+            if due is not None and due > t:
+                stop_at(self._cvode, due)
+            _, roots, t = self._cvode.step(t, stop)
+            event = bool(roots.any())
+            if not event and math.isclose(t, stop, rel_tol=1e-14):
+                t = stop
+            if not event and t == due:
+                self._not_beyond = t
             self._fmu.set_time(t)
-            return bool(event), stop if not event and math.isclose(t, stop, rel_tol=1e-14) else t
+            return event, t
         if self._n:
             return self._by_dop853(t, stop)
         none = np.empty(0)

@@ -127,7 +127,7 @@ def test_the_orbit_over_6000_s(exported, fmi, settings):
     assert integrated["delta_v_e"] == pytest.approx(expected["delta_v_e"], abs=1e-9)
 
 
-@pytest.mark.parametrize("fmi", VERSIONS)
+@pytest.mark.parametrize("fmi", [3, pytest.param(2, marks=pytest.mark.campaign)])
 def test_a_whole_system_as_one_fmu(tmp_path, fmi):
     """Schedule, order, messages and start-reads inside; exposed ports outside."""
     file = without_evaluation(tmp_path / "system.toml")
