@@ -14,6 +14,7 @@ from terrafix.components.fields import AMPLITUDE, GRID, HEIGHT, PLACES, RADAR, S
 from terrafix.components.ground import OnGround
 from terrafix.components.sensors.aperture import MARK
 from terrafix.components.sensors.compiled import row_operations
+from terrafix.components.sensors.echo import RecordedEcho
 from terrafix.components.sensors.files import (
     file_of_step,
     near_range,
@@ -243,16 +244,10 @@ class RecordedReference(_Reference):
     true orbit, displaced in time with the recording, and the heights of the terrain.
     """
 
-    folder = FilePath(doc="where the files are")
-    files = Text(doc="names of the files (.npz, .h5), one for each step, separated by blanks")
-    range0 = Parameter(
-        np.inf,
-        unit="m",
-        positive=True,
-        infinite=True,
-        doc="slant range of cell 1 of the recording; inf: the files'",
-    )
-    start_line = Parameter(1.0, doc="line of the recording, fractional, at t = 0")
+    folder = RecordedEcho.folder
+    files = RecordedEcho.files
+    range0 = RecordedEcho.range0
+    start_line = RecordedEcho.start_line
     band = Parameter(
         [0.0, 1.0], shape=(2,), minimum=0.0, maximum=1.0, doc="part of the Doppler band shown"
     )

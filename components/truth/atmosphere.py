@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafix.components.dated import read_epoch
+from terrafix.components.dated import Dated, read_epoch
 from terrafix.components.fields import AIR, XYZ
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError, EpochError
-from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import BundleOutput, Input
-from terrafix.models.core.timescales import Instant
 from terrafix.models.motion.air import air_about
 from terrafix.models.motion.epochs import utc_tag
 
 
-class Atmosphere(Component):
+class Atmosphere(Dated):
     """Density about a satellite by MSIS 2.1, from the indices of solar and geomagnetic activity.
 
     Between publications its reader takes the logarithm of the density to be linear in radius and
@@ -32,8 +30,6 @@ class Atmosphere(Component):
     r_e = Input((3,), unit="m", frame="e", labels=XYZ, doc="position")
     air = BundleOutput(AIR, doc="density about it")
 
-    _start: Instant | None = None
-
     def validate_epoch(self, epoch: str | None) -> None:
         """Look whether the date is known, and MSIS installed."""
         self._start = read_epoch(self, epoch)
@@ -44,20 +40,8 @@ class Atmosphere(Component):
         except ImportError as error:
             raise ConfigurationError(f"'{self.name}': {error}") from error
 
-    def bind(self, environment: Environment) -> None:
-        """Read the epoch."""
-        super().bind(environment)
-        self._start = read_epoch(self, environment.epoch)
-
-    def _initialize_impl(self) -> None:
-        self._publish(0.0)
-
-    def _step_impl(self, t: float, dt: float) -> None:
-        self._publish(t)
-
     def _publish(self, t: float) -> None:
-        assert self._start is not None
-        now = utc_tag(self._start.plus(t))
+        now = utc_tag(self._now(t))
         density, gradient = air_about(self.r_e, now, self.f107, self.f107a, self.ap)
         self.air.r_e[:] = self.r_e
         self.air.log_density[:] = density

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from terrafix.components.dated import read_epoch
+from terrafix.components.dated import Dated, read_epoch
 from terrafix.components.fields import ENVIRONMENT
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import EpochError
-from terrafix.cosim.declare.component import Component, Environment
 from terrafix.cosim.declare.ports import BundleOutput, Capabilities
 from terrafix.models.core.timescales import Instant
 from terrafix.models.motion.bodies import environment_at
 
 
-class SpaceEnvironment(Component):
+class SpaceEnvironment(Dated):
     """How the Earth turns, and where the Sun and the Moon are, at the epoch of the system.
 
     By the full chain of the IAU and the tables of the IERS, alike for all members. It changes so
@@ -25,8 +24,6 @@ class SpaceEnvironment(Component):
 
     capabilities: ClassVar[Capabilities] = Capabilities(given=True)
     default_rate = Rate("10")
-
-    _start: Instant | None = None
 
     surroundings = BundleOutput(ENVIRONMENT, doc="rotation of the Earth, Sun and Moon")
 
@@ -50,19 +47,7 @@ class SpaceEnvironment(Component):
                 f"'{self.name}' does not know the world of the run: {error}"
             ) from error
 
-    def bind(self, environment: Environment) -> None:
-        """Read the epoch."""
-        super().bind(environment)
-        self._start = read_epoch(self, environment.epoch)
-
-    def _initialize_impl(self) -> None:
-        self._publish(0.0)
-
-    def _step_impl(self, t: float, dt: float) -> None:
-        self._publish(t)
-
     def _publish(self, t: float) -> None:
-        assert self._start is not None
         self.surroundings.time = t
-        for name, value in environment_at(self._start.plus(t)).items():
+        for name, value in environment_at(self._now(t)).items():
             setattr(self.surroundings, name, value)

@@ -206,8 +206,8 @@ def plan_shown(content: Mapping[str, Any]) -> list[Block]:
     ]
     return [
         Text(
-            f"{content['system']}: {len(rows)} components in stepping order, "
-            f"{len(content['connections'])} connections, base step {content['base_step']}"
+            f"{content['system']}: {_count(len(rows), 'component')} in stepping order, "
+            f"{_count(len(content['connections']), 'connection')}, base step {content['base_step']}"
             + (f", epoch {content['epoch']}" if "epoch" in content else "")
         ),
         Table(["", "component", "type", "steps"], rows),

@@ -48,7 +48,7 @@ from terrafix.models.radar.chirp import (
     compression_filter,
     padded_length,
 )
-from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
+from terrafix.models.radar.spectra import ARRAY_ROWS, Columns, Rows
 
 _ROWS = 128
 """Of a batch whose range is compressed: few enough to stay in the cache."""
@@ -286,20 +286,22 @@ def range_doppler(
     slant_range = np.asarray(near_range + spacing * (np.arange(n_cells) - n_shift), np.float64)
     reference = near_range * d_center + spacing * (n_cells - n_pulse) / 2
     f_r = fft.fftfreq(n_fft, 1 / radar.sample_rate)
-    squared, rest = (radar.carrier + f_r) ** 2, f_r * (1 + n_shift * spacing / reference)
     transverse = (SPEED_OF_LIGHT * frequency / (2 * velocity)) ** 2
     factor = np.ones(n_fft, np.complex64)
     if not compressed:
         factor = compression_filter(radar, n_fft, window)
+    along = Columns(
+        factor,
+        (radar.carrier + f_r) ** 2,
+        f_r * (1 + n_shift * spacing / reference),
+        2 * reference / SPEED_OF_LIGHT,
+    )
     subtracted, stretch = radar.carrier * d, 1 / d - 1
     origin = (reference - slant_range[0]) / spacing
 
     def straighten(batch: slice) -> None:
         spectrum = fft.fft(lines[batch], n_fft, axis=1)
-        operations.straighten(
-            *(spectrum, factor, squared, transverse[batch], subtracted[batch], rest),
-            2 * reference / SPEED_OF_LIGHT,
-        )
+        operations.straighten(spectrum, along, transverse[batch], subtracted[batch])
         spectrum = fft.ifft(spectrum, axis=1, overwrite_x=True)
         lines[batch] = operations.stretched(spectrum[:, :n_cells], origin, stretch[batch])
 

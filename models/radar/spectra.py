@@ -8,6 +8,7 @@ Beside transforms this is what imaging costs. It is compiled from ``spectra.c`` 
 from __future__ import annotations
 
 import ctypes
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,7 +21,7 @@ from terrafix.models.radar.chirp import unit_phasor
 
 _TAPS, _BAND = 16, 0.43
 """Cells that interpolation weighs, and the band that it is made for, in cycles per cell. Its error
-is 0.3 % rms up to 0.4 cycles per cell, and 4 % over 0.466, the band of RADARSAT-1's pulses."""
+is 0.3 % rms up to 0.4 cycles per cell, and 4.4 % over 0.466, the band of RADARSAT-1's pulses."""
 _FINE = 1024
 """Places between two cells that kernels are tabulated at."""
 _BLOCK_SHIFT = 0.01
@@ -51,20 +52,31 @@ def _pairs() -> Single:
     return np.repeat(kernels(), 2, axis=1)
 
 
+@dataclass(frozen=True)
+class Columns:
+    """What rows are straightened by that is the same for all of them, see `Rows.straighten`.
+
+    Parameters
+    ----------
+    factor : ndarray of complex64, shape (n_columns,)
+    squared, rest : ndarray, shape (n_columns,)
+    scale : float
+        In cycles per unit of the root.
+    """
+
+    factor: ComplexArray
+    squared: FloatArray
+    rest: FloatArray
+    scale: float
+
+
 class Rows(Protocol):
     """Operations on rows, complex64 (n_rows, n_columns); what is said of i and j is of them."""
 
     def straighten(
-        self,
-        rows: ComplexArray,
-        factor: ComplexArray,
-        squared: FloatArray,
-        transverse: FloatArray,
-        subtracted: FloatArray,
-        rest: FloatArray,
-        scale: float,
+        self, rows: ComplexArray, along: Columns, transverse: FloatArray, subtracted: FloatArray
     ) -> None:
-        r"""Multiply by ``factor[j]`` and turn by a root's phase, in place.
+        """Multiply by ``factor[j]`` and turn by a root's phase, in place.
 
         By ``scale * (sqrt(squared[j] - transverse[i]) - subtracted[i] - rest[j])`` cycles.
         """
@@ -93,22 +105,15 @@ class ArrayRows:
     """The operations with NumPy."""
 
     def straighten(
-        self,
-        rows: ComplexArray,
-        factor: ComplexArray,
-        squared: FloatArray,
-        transverse: FloatArray,
-        subtracted: FloatArray,
-        rest: FloatArray,
-        scale: float,
+        self, rows: ComplexArray, along: Columns, transverse: FloatArray, subtracted: FloatArray
     ) -> None:
         """Multiply by a factor of columns and turn by a root's phase, in place."""
-        root = squared - transverse[:, None]
+        root = along.squared - transverse[:, None]
         np.sqrt(root, out=root)
         root -= subtracted[:, None]
-        root -= rest
-        root *= scale
-        rows *= factor
+        root -= along.rest
+        root *= along.scale
+        rows *= along.factor
         rows *= unit_phasor(root)
 
     def turn(
@@ -198,22 +203,15 @@ class CompiledRows:
             function.restype = None
 
     def straighten(
-        self,
-        rows: ComplexArray,
-        factor: ComplexArray,
-        squared: FloatArray,
-        transverse: FloatArray,
-        subtracted: FloatArray,
-        rest: FloatArray,
-        scale: float,
+        self, rows: ComplexArray, along: Columns, transverse: FloatArray, subtracted: FloatArray
     ) -> None:
         """Multiply by a factor of columns and turn by a root's phase, in place."""
         n, m = _contiguous(rows)
-        columns = [_of(squared, m), _of(rest, m), _of(transverse, n), _of(subtracted, n)]
-        factor = _of(factor, m, np.complex64)
+        arrays = [_of(along.squared, m), _of(along.rest, m), _of(transverse, n), _of(subtracted, n)]
+        factor = _of(along.factor, m, np.complex64)
         self._straighten(
-            *(n, m, *(a.ctypes.data for a in columns)),
-            *(scale, factor.ctypes.data, rows.ctypes.data),
+            *(n, m, *(a.ctypes.data for a in arrays)),
+            *(along.scale, factor.ctypes.data, rows.ctypes.data),
         )
 
     def turn(

@@ -62,6 +62,7 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
 }
 FOREIGN = {"elements", "fmu", "fmu_loop", "linear"}  # whose ports come from files: tests/fmi
 BASES = {  # of which types are made
+    "Dated",
     *("EnsembleCorrect", "FilterAcquisition", "FilterCorrect", "FilterEvaluation", "FilterMonitor"),
     *("FilterPredict", "FilterSensor", "FilterTruth", "NoisyComponent", "OnGround", "OnReference"),
     *("Optics", "Playback", "SendsChirps"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafix.components.sensors import compiled
-from terrafix.models.radar.spectra import ARRAY_ROWS, ArrayRows, CompiledRows, kernels
+from terrafix.models.radar.spectra import ARRAY_ROWS, ArrayRows, Columns, CompiledRows, kernels
 
 N, M = 5, 700
 
@@ -42,7 +42,7 @@ def test_rows_are_straightened_by_the_phase_of_a_root(operations):
     cycles = scale * (np.sqrt(squared - transverse[:, None]) - subtracted[:, None] - rest)
     assert np.abs(cycles).max() > 1e4
     expected = own * factor * np.exp(2j * np.pi * cycles)
-    operations.straighten(own, factor, squared, transverse, subtracted, rest, scale)
+    operations.straighten(own, Columns(factor, squared, rest, scale), transverse, subtracted)
     close(own, expected, 1e-5 * np.abs(expected).max())
 
 

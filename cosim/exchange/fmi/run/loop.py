@@ -118,6 +118,11 @@ class FmuLoop(Telling):
             if port.is_input
             else Output(one.fixed_shape, **options)
         )
+        if name in self.ports or name in self._found_settings or hasattr(FmuLoop, name):
+            raise ConfigurationError(
+                f"'{self.name}': a port of its FMUs would be called '{name}', as another port or "
+                "parameter is\n  give one of the FMUs another name in files"
+            )
         made.name = name
         self.ports[name] = made
 

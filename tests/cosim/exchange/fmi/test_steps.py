@@ -7,6 +7,7 @@ import pytest
 from small_fmus import Variable, small_fmu
 
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.exchange.fmi.run import fleet
@@ -60,18 +61,36 @@ def test_the_tolerance_of_the_default_experiment_is_handed_on_and_can_be_set(tel
         assert float(found["y"][-1]) == 1e-4
 
 
+STATE = {
+    "interface": ' canGetAndSetFMUstate="true"',
+    "globals_": "".join(
+        f"EXPORT int fmi2{n}(void *m, void *s) {{ return 0; }}"
+        for n in ("GetFMUstate", "SetFMUstate", "FreeFMUstate")
+    ),
+}
+
+
+def test_ports_of_a_loop_that_would_have_one_name_are_refused(tmp_path):
+    """Output b_y of FMU a, and y of FMU a_b: one stood for both, without a word."""
+    files = {
+        "a": small_fmu(tmp_path / "a.fmu", 2, [Variable("b_y", start="1.0")], **STATE),
+        "a_b": small_fmu(tmp_path / "ab.fmu", 2, [Variable("y", start="2.0")], **STATE),
+    }
+    loop = FmuLoop(files=files, connect="", rate=Rate("0.1"))
+    with pytest.raises(
+        ConfigurationError, match="a port of its FMUs would be called 'a_b_y', as an"
+    ):
+        final(loop, "part.a_b_y")
+
+
 def test_a_loop_hands_the_tolerance_on(tmp_path):
-    state = ' canGetAndSetFMUstate="true"'
-    names = ("GetFMUstate", "SetFMUstate", "FreeFMUstate")
-    functions = "".join(f"EXPORT int fmi2{n}(void *m, void *s) {{ return 0; }}" for n in names)
     file = small_fmu(
         tmp_path / "t.fmu",
         2,
         [Variable("y", start="0.0"), Variable("u", causality="input", start="0.0")],
         step="m->r[0] = m->tolerance;",
         experiment='tolerance="1e-4"',
-        interface=state,
-        globals_=functions,
+        **STATE,
     )
     loop = FmuLoop(files={"a": file}, connect="a.y -> a.u", rate=Rate("0.1"))
     assert final(loop, "part.a_y") == 1e-4
