@@ -224,7 +224,7 @@ def test_nodes_are_shown_by_type():
 def test_check_gives_a_plan_that_shows_itself(toys):
     system = toys.wire({"clock": toys.Clock(), "spy": toys.EndSpy()}, ["clock.t -> spy.u"])
     assert repr(system.check()) == (
-        f"{system.name}: 2 components in stepping order, 1 connections, base step 1 s\n"
+        f"{system.name}: 2 components in stepping order, 1 connection, base step 1 s\n"
         "    component   type     steps\n"
         "──────────────────────────────────\n"
         "1   clock       Clock    every 1 s\n"
