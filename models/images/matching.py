@@ -48,6 +48,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import binom
 
 from terrafix.models.core.arrays import FloatArray, Single
 
@@ -82,8 +83,10 @@ _LOBE = 6
 """Half the side of a peak: no other is counted there [searched pixels]."""
 _SPACINGS = 16
 """Peaks that the first one is held against."""
+_AMBIGUOUS = 1e-3
+"""Chance that the highest of wrong peaks stands out so much: at most."""
 _CHANCE = 1e-6
-"""That the highest of wrong peaks stands out so much."""
+"""Chance of that and of so many parts that agree with it: at most."""
 _CORNERS = 6.0
 """Most that a turn or stretch moves the image's corners between those tried [pixels]."""
 _MOST = 41
@@ -102,6 +105,9 @@ _NEAR = 2.0
 """How close they must come [pixels]."""
 _AGREE = 4
 """How many must."""
+_BY_CHANCE = 0.1
+"""Share that does at wrong places: those within 2 pixels are 0.04 of those looked at, and a peak of
+the whole is where its parts are high. Measured at wrong places: 0.07."""
 _SCATTER = 0.5
 """Largest standard error: three of them are the 1.5 pixels that a fix may be off."""
 
@@ -204,7 +210,7 @@ class Match:
     correlation : float
         Of the whole image at the peak, -1 to 1.
     chance : float
-        That the highest of wrong peaks stands out as much.
+        That the highest of wrong peaks stands out as much, and as many parts agree with it.
     shift : ndarray, shape (2,)
         Of the center from where it was predicted, in the image's rows and columns [pixels].
     rotation, scale : float
@@ -353,7 +359,7 @@ def matched(
     peak = _searched(image, drawn, predicted)
     if peak is None:
         return _refused("no place stands out of the others")
-    if peak.chance > _CHANCE:
+    if peak.chance > _AMBIGUOUS:
         return _refused("no place stands out of the others", peak.chance)
     aligned = _aligned(image, drawn, predicted, peak, c)
     if aligned is None:
@@ -381,10 +387,11 @@ def _judged(
     slope = predicted.slope(*found)
     row, column = predicted.at(found[:1], found[1:])[0, 0]
     agreeing = _agreeing(image, drawn, W)
+    chance = peak.chance * float(binom.sf(len(agreeing) - 1, _BLOCKS**2, _BY_CHANCE))
     reason = "accepted"
     if np.linalg.eigvalsh(covariance)[1] > _SCATTER**2:
         reason = "too little in it holds it in place"
-    elif len(agreeing) < _AGREE:
+    elif len(agreeing) < _AGREE or chance > _CHANCE:
         reason = "its parts do not agree on where it lies"
     elif _far(shift, predicted.covariance + covariance):
         reason = "it lies farther off than the prediction can be"
@@ -398,7 +405,7 @@ def _judged(
         reason == "accepted",
         reason,
         aligned.correlation,
-        peak.chance,
+        chance,
         shift,
         aligned.turn,
         1 + aligned.growth,
