@@ -110,8 +110,7 @@ class ImageMatcher(OnReference):
 
     def _placed(self, reference: Reference, dem: Dem, match: Match) -> tuple[float, float, float]:
         """Latitude, longitude [rad] and height of the terrain [m] where an image lies."""
-        latitude, longitude, _ = reference.place(match.row, match.column)
-        return float(latitude), float(longitude), float(dem.at(latitude, longitude))
+        return reference.place_on(dem.at, match.row, match.column)
 
     def _covered_reference(self) -> Reference:
         reference = self._reference()
