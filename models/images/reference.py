@@ -245,7 +245,12 @@ def _between(x: ArrayLike, knots: FloatArray, what: str) -> tuple[np.ndarray, Fl
 
 
 def geocoded(
-    image: Image, arc: Arc, terrain: Height, looks: tuple[int, int], n_ties: int = 33
+    image: Image,
+    arc: Arc,
+    terrain: Height,
+    looks: tuple[int, int],
+    n_ties: int = 33,
+    side: int = 1,
 ) -> Reference:
     """Reference from a focused image whose orbit is known.
 
@@ -260,6 +265,8 @@ def geocoded(
         Pixels averaged in azimuth and range.
     n_ties : int
         Tie points along each axis.
+    side : {1, -1}
+        To the right of the track, or to the left.
     """
     amplitude = detected(image.valid, looks)
     ties = [np.linspace(0, n - 1, n_ties) for n in amplitude.shape]
@@ -270,7 +277,7 @@ def geocoded(
     t, R = image.seen_at(row[:, None], column[None, :], image.doppler)
     r, v = arc.position(t), arc.velocity(t)
     sine = image.radar.wavelength * image.doppler / (2 * np.linalg.norm(v, axis=-1))
-    p = ground_point_on_terrain(r, v, R, sine, terrain)
+    p = ground_point_on_terrain(r, v, R, sine, terrain, side=side)
     return Reference(amplitude, ties[0], ties[1], *geodetic(p))
 
 
