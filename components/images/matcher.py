@@ -110,8 +110,7 @@ class ImageMatcher(OnReference):
 
     def _placed(self, reference: Reference, dem: Dem, match: Match) -> tuple[float, float, float]:
         """Latitude, longitude [rad] and height of the terrain [m] where an image lies."""
-        latitude, longitude, _ = reference.place(match.row, match.column)
-        return float(latitude), float(longitude), float(dem.at(latitude, longitude))
+        return reference.place_on(dem.at, match.row, match.column)
 
     def _covered_reference(self) -> Reference:
         reference = self._reference()
@@ -130,7 +129,10 @@ class ImageMatcher(OnReference):
         """Raise where nothing was recognized because the reference is of another place."""
         r, v, P = (getattr(self.prior, k)[fresh] for k in ("r_e", "v_e", "P"))
         try:
-            p = ground_point(r, v, self.image.slant_range[fresh], self.image.sine[fresh])
+            side = 1 if self.image.side[fresh][0] > 0 else -1
+            p = ground_point(
+                *(r, v, self.image.slant_range[fresh], self.image.sine[fresh]), side=side
+            )
         except ValueError:  # an estimate that sees no ground says nothing of the reference
             return
         latitude, longitude, _ = geodetic(p)
