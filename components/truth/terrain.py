@@ -26,10 +26,16 @@ from terrafix.models.maps.dem import (
     read_jacksboro,
     rolling_dem,
 )
+from terrafix.models.radar.cover import COVERS
 from terrafix.models.radar.scene import Scene
 
 _log = logging.getLogger(__name__)
 SOURCES = ("file", "jacksboro", "flat", "hills")
+_UNREAD = {
+    "texture": ("parcels", "point_density", "point_brightness"),
+    "urban": ("point_density",),
+}
+"""What a cover has no use for."""
 _OF_HILLS = ("relief", "relief_length", "relief_seed", "error", "error_length", "error_seed")
 
 
@@ -62,6 +68,12 @@ class Terrain(Component):
     fill_voids = Flag(False, doc="interpolate voids, and say so, instead of refusing them")
     surface_seed = Count(0, maximum=2**53, doc="of texture and bright points")
     detail = Count(1, minimum=1, doc="how fine texture is: 1 from orbit, 10 from an aircraft")
+    cover = Choice(
+        COVERS,
+        "parcels",
+        doc="of the ground: parcels; texture, without borders and points; urban; coast; causeway, "
+        "in the sea; fields",
+    )
     parcels = Parameter(2.5, minimum=0.0, doc="texture with sharp borders, standard deviation [dB]")
     smooth = Parameter(1.5, minimum=0.0, doc="smooth texture, standard deviation [dB]")
     fine = Parameter(1.5, minimum=0.0, doc="fine texture, standard deviation [dB]")
@@ -70,7 +82,7 @@ class Terrain(Component):
 
     height = SharedOutput(**HEIGHT, doc="heights, southernmost row first")
     grid = SharedOutput(**GRID, doc="first point and spacing; whether mirrored")
-    surface = SharedOutput(**SURFACE, doc="seed, strength, points, detail of the texture")
+    surface = SharedOutput(**SURFACE, doc="seed, strength, points, detail, cover of the ground")
 
     def validate(self) -> None:
         """Read the elevation model."""
@@ -123,6 +135,8 @@ class Terrain(Component):
 
     def takes(self, name: str) -> bool:
         """Whether a setting has any effect: heights of hills have where there are hills."""
+        if name in _UNREAD.get(self.setting("cover"), ()):
+            return False
         hills = self.setting("source") == "hills"
         if name in _OF_HILLS:
             return hills and (not name.startswith("error_") or float(self.setting("error")) > 0)
@@ -154,7 +168,12 @@ class Terrain(Component):
             self.point_brightness,
         )
         self.surface = np.array(
-            [float(self.surface_seed), *(float(s[0]) for s in strengths), float(self.detail)]
+            [
+                float(self.surface_seed),
+                *(float(s[0]) for s in strengths),
+                float(self.detail),
+                float(COVERS.index(self.cover)),
+            ]
         )
 
     def _step_impl(self, t: float, dt: float) -> None:
@@ -163,7 +182,7 @@ class Terrain(Component):
 
 def scene_from(height: Single, grid: FloatArray, surface: FloatArray) -> Scene:
     """What the ground looks like to a radar, from the ports of a terrain."""
-    seed, parcels, smooth, fine, density, brightness, detail = (float(s) for s in surface)
+    seed, *strengths, detail, cover = (float(s) for s in surface)
     return Scene(
-        dem_from(height, grid), int(seed), parcels, smooth, fine, density, brightness, int(detail)
+        dem_from(height, grid), int(seed), *strengths, detail=int(detail), cover=COVERS[int(cover)]
     )

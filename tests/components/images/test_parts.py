@@ -49,7 +49,7 @@ def bound(component, name, seed=0, **views):
 def surface_views():
     dem = flat_dem(100.0)
     grid = np.array([0.0, 0.0, 1.0, 1.0, 1.0])
-    shared = {"height": dem.height, "grid": grid, "surface": np.array([1.0, 0, 0, 0, 0, 0, 1])}
+    shared = {"height": dem.height, "grid": grid, "surface": np.array([1.0, 0, 0, 0, 0, 0, 1, 0])}
     return {k: SimpleNamespace(value=v) for k, v in shared.items()}
 
 

@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from terrafix.components.truth.terrain import Terrain
+from terrafix.components.truth.terrain import Terrain, scene_from
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.system import System
@@ -64,3 +64,15 @@ def test_what_hills_do_not_read_is_refused():
     assert not Terrain(source="flat").takes("relief")
     with pytest.raises(SystemCheckError, match=r"set terrain\.relief_length"):
         terrain_of(relief_length=5.0)
+
+
+def test_what_covers_the_ground_is_told_and_what_it_has_no_use_for_is_refused():
+    system = System("ground")
+    terrain = system.add(Terrain(source="flat", cover="coast", surface_seed=4), name="terrain")
+    Simulation(system).run_until("0")
+    scene = scene_from(terrain.height, terrain.grid, terrain.surface)
+    assert (scene.cover, scene.seed, scene.points_db, scene.detail) == ("coast", 4, 25.0, 1)
+    assert terrain.takes("point_density")
+    assert not Terrain(source="flat", cover="texture").takes("parcels")
+    assert not Terrain(source="flat", cover="urban").takes("point_density")
+    assert Terrain(source="flat", cover="urban").takes("point_brightness")
