@@ -25,6 +25,7 @@ from terrafix.models.maps.dem import (
     read_dem,
     read_jacksboro,
     rolling_dem,
+    roughened,
 )
 from terrafix.models.radar.cover import COVERS
 from terrafix.models.radar.scene import Scene
@@ -36,7 +37,8 @@ _UNREAD = {
     "urban": ("point_density",),
 }
 """What a cover has no use for."""
-_OF_HILLS = ("relief", "relief_length", "relief_seed", "error", "error_length", "error_seed")
+_OF_HILLS = ("relief", "relief_length", "relief_seed")
+_OF_ERRORS = ("error_length", "error_seed")
 
 
 class Terrain(Component):
@@ -60,10 +62,10 @@ class Terrain(Component):
     relief_length = Parameter(150.0, unit="m", positive=True, doc="its correlation (hills)")
     relief_seed = Count(0, maximum=2**32, doc="of the heights (hills)")
     error = Parameter(
-        0.0, unit="m", minimum=0.0, doc="rms by which these are not the true heights (hills)"
+        0.0, unit="m", minimum=0.0, doc="rms by which these are not the true heights (not flat)"
     )
-    error_length = Parameter(150.0, unit="m", positive=True, doc="correlation of the error (hills)")
-    error_seed = Count(1, maximum=2**32, doc="of the error (hills)")
+    error_length = Parameter(150.0, unit="m", positive=True, doc="correlation of the error")
+    error_seed = Count(1, maximum=2**32, doc="of the error")
     mirrored = Flag(False, doc="go on for ever in mirror images: artificial, without borders")
     fill_voids = Flag(False, doc="interpolate voids, and say so, instead of refusing them")
     surface_seed = Count(0, maximum=2**53, doc="of texture and bright points")
@@ -115,7 +117,20 @@ class Terrain(Component):
                 f"'{self.name}' is to mirror '{dem.name}', of which {dem.n_void} points are void\n"
                 f"  set {self.name}.fill_voids = true, or use another"
             )
-        return dem.tiled() if self.setting("mirrored") else dem
+        dem = dem.tiled() if self.setting("mirrored") else dem
+        return self._with_errors(dem)
+
+    def _with_errors(self, dem: Dem) -> Dem:
+        """What is known of the heights, where they are to be known with errors."""
+        rms, length = (float(shared_setting(self, name)) for name in ("error", "error_length"))
+        if not rms:
+            return dem
+        try:
+            return roughened(dem, rms, length, self.setting("error_seed"))
+        except ValueError as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot err: {error}\n  set {self.name}.error_length"
+            ) from error
 
     def _hills(self) -> Dem:
         """Artificial heights, and an error of them where one is asked for."""
@@ -139,7 +154,11 @@ class Terrain(Component):
             return False
         hills = self.setting("source") == "hills"
         if name in _OF_HILLS:
-            return hills and (not name.startswith("error_") or float(self.setting("error")) > 0)
+            return hills
+        if name == "error":
+            return bool(self.setting("source") != "flat")
+        if name in _OF_ERRORS:
+            return self.takes("error") and float(self.setting("error")) > 0
         return super().takes(name) and not (hills and name in ("mirrored", "fill_voids"))
 
     def _initialize_impl(self) -> None:

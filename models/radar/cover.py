@@ -44,7 +44,7 @@ BUILT = float(np.mean(1 - _STREET / _BLOCKS)) ** 2
 _FARM = 54
 """Side of the squares that are divided into fields [cells]."""
 _MOST_FIELDS = 4
-_CROPS = np.array([-1.414, -0.707, 0.0, 0.707, 1.414], np.float32)
+CROPS = np.array([-1.414, -0.707, 0.0, 0.707, 1.414], np.float32)
 """Brightness of fields, one of five as often as another, in standard deviations."""
 _LINES = 540
 """Spacing of causeways from west to east [cells of longitude]."""
@@ -160,10 +160,9 @@ def fields(at: Districts) -> Words:
     return words(0, "fields", farm, np.floor(along * number).astype(np.int64))
 
 
-def crops(seed: int, own: Words) -> Single:
-    """Brightness of fields or blocks, by numbers of their own, in standard deviations."""
-    kind = words(seed, "crops", own) % np.uint64(len(_CROPS))
-    return np.asarray(_CROPS[kind.astype(np.int64)])
+def crops(seed: int, own: Words) -> NDArray[np.int64]:
+    """Which of `CROPS` fields or blocks are, by numbers of their own."""
+    return np.asarray((words(seed, "crops", own) % np.uint64(len(CROPS))).astype(np.int64))
 
 
 def causeway(seed: int, rows: range, columns: range, cell: float) -> Single:

@@ -144,7 +144,8 @@ class Scene:
             texture += np.float32(np.sqrt(1 - self.correlation**2)) * other
         if self.cover == "urban":
             texture[self._streets(rows, columns)] += np.float32(patterns.STREET_DB)
-        return self._at_sea(texture, rows, columns)
+        sea = np.float32(patterns.SEA_DB) + np.float32(patterns.CALM) * texture
+        return self._with_sea(texture, sea, rows, columns)
 
     def _on_land(self, seed: int, rows: range, columns: range) -> Single:
         """What changes with the seasons [dB]."""
@@ -180,18 +181,19 @@ class Scene:
         """Brightness of blocks or fields, in standard deviations."""
         at = patterns.districts(self.seed, rows, columns, self.cell)
         own = patterns.streets(at)[1] if self.cover == "urban" else patterns.fields(at)
-        return patterns.crops(seed, own)
+        return np.asarray(patterns.CROPS[patterns.crops(seed, own)])
 
     def _streets(self, rows: range, columns: range) -> NDArray[np.bool_]:
         return patterns.streets(patterns.districts(self.seed, rows, columns, self.cell))[0]
 
-    def _at_sea(self, texture: Single, rows: range, columns: range) -> Single:
-        """The same [dB], but where the sea is."""
+    def _with_sea(
+        self, texture: Single, sea: Single | np.float32, rows: range, columns: range
+    ) -> Single:
+        """Texture on land and that of the sea, in what mixture cells have of them [dB]."""
         land = self._land(rows, columns)
         if land is None:
             return texture
         to_power = np.float32(np.log(10) / 10)
-        sea = np.float32(patterns.SEA_DB) + np.float32(patterns.CALM) * texture
         power = land * np.exp(texture * to_power) + (1 - land) * np.exp(sea * to_power)
         return np.asarray(np.log(power) / to_power)
 
@@ -273,6 +275,59 @@ class Scene:
             free = land > 0.5
         i, j = (np.rint(p).astype(np.int64) - r.start for p, r in zip(points, wide, strict=False))
         return points[:, free[i, j]]
+
+
+@dataclass(frozen=True, eq=False)
+class CoverMap(Scene):
+    """What a land-cover map tells of a scene: borders of classes, and how bright a class is.
+
+    It knows no fine and smooth variation and no single building, and the brightness of each class
+    is off by an error of its own. The classes of a town are block and street, those of fields and
+    parcels kinds of them.
+
+    Parameters
+    ----------
+    class_sigma : float
+        Standard deviation of the errors of brightness [dB].
+    map_seed : int
+        Of these errors.
+    """
+
+    class_sigma: float = 0.0
+    map_seed: int = 0
+
+    def points(
+        self, rows: range, columns: range
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """No points."""
+        empty = np.empty(0)
+        return empty, empty, empty, empty
+
+    def _texture(self, rows: range, columns: range) -> Single:
+        kind, levels = self._classes(rows, columns)
+        errors = _generator(self.map_seed, "classes").standard_normal(len(levels) + 1)
+        errors *= self.class_sigma
+        texture = (levels + errors[:-1]).astype(np.float32)[kind]
+        sea = np.float32(patterns.SEA_DB + errors[-1])
+        return self._with_sea(texture, sea, rows, columns)
+
+    def _classes(self, rows: range, columns: range) -> tuple[NDArray[np.int64], FloatArray]:
+        """Class of each cell, and the mean brightness of each class [dB]."""
+        shape = len(rows), len(columns)
+        if self.cover == "texture":
+            return np.zeros(shape, np.int64), np.zeros(1)
+        if self.cover == "urban":
+            return self._streets(rows, columns).astype(np.int64), np.array([0, patterns.STREET_DB])
+        if self.cover == "fields":
+            at = patterns.districts(self.seed, rows, columns, self.cell)
+            kinds = patterns.crops(self.seed, patterns.fields(at))
+            return kinds, self.parcels_db * patterns.CROPS
+        ci, cj = _coarse_cells(rows, columns)
+        kinds = np.zeros(shape, np.int64)
+        for weight, name in ((2, "parcels a"), (1, "parcels b")):
+            field = _smoothed_noise(self.seed, name, ci, cj, _PARCEL)
+            kinds += weight * (_enlarged(field, ci, cj, rows, columns) > 0)
+        return kinds, self.parcels_db / np.sqrt(2) * np.array([-2.0, 0.0, 0.0, 2.0])
 
 
 def _within_a_turn(columns: range, around: int) -> list[tuple[range, int]]:
