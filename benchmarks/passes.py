@@ -11,6 +11,7 @@ import numpy as np
 
 from terrafix.models.core.arrays import FloatArray, Single
 from terrafix.models.geometry.ground import EllipsoidGround
+from terrafix.models.images.matching import Match, Searchable, matched
 from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import Dem
 from terrafix.models.motion.arc import OrbitArc
@@ -119,3 +120,8 @@ def seen(scene: Scene, grid: Footprint, rng: np.random.Generator, snr_db: float 
         height += 0.5 * (float(scene.dem.at(latitude, longitude)) - height)
     place = np.array([float(latitude), float(longitude), height])
     return Seen(amplitude, reference, (row, column), place)
+
+
+def found(image: Seen, reference: Reference) -> Match:
+    """Where the matcher finds an image on a reference, by nothing but the two."""
+    return matched(Searchable(image.amplitude), Searchable(reference.amplitude), image.middle)

@@ -33,7 +33,7 @@ from terrafix.cosim.declare.ports import Input, MessageInput, SharedInput, Share
 from terrafix.models.core.arrays import Single
 from terrafix.models.geometry.geolocation import track_axes
 from terrafix.models.images.reference import Reference, earlier_pass, geocoded, read_reference
-from terrafix.models.images.rendered import rendered
+from terrafix.models.images.rendered_reference import rendered
 from terrafix.models.maps.dem import Dem, dem_from
 from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.motion.sampled import SampledArc

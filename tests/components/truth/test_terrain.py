@@ -43,7 +43,7 @@ def test_a_terrain_without_a_file_is_a_problem_of_the_check():
 
 def terrain_of(**settings):
     system = System("ground")
-    system.add(Terrain(source="hills", **settings), name="terrain")
+    system.add(Terrain(**{"source": "hills"} | settings), name="terrain")
     simulation = Simulation(system)
     simulation.run_until("0")
     return np.array(system.nodes["terrain"].height)
@@ -54,6 +54,20 @@ def test_heights_that_are_not_the_true_ones_are_off_by_their_error():
     true, known = terrain_of(), terrain_of(error=3.0)
     assert (known - true).std() == pytest.approx(3.0, rel=1e-4)
     assert np.array_equal(true, terrain_of())
+
+
+def test_heights_of_any_source_but_a_flat_one_can_err():
+    """As hills: 3 m rms. And a border of the model is too near for errors 20 km long."""
+    true, known = (
+        terrain_of(source="jacksboro", mirrored=True, **settings)
+        for settings in ({}, {"error": 3.0, "error_length": 300.0})
+    )
+    assert (known - true).std() == pytest.approx(3.0, rel=1e-4)
+    assert not Terrain(source="flat").takes("error")
+    assert not Terrain(source="jacksboro").takes("error_length")
+    assert Terrain(source="jacksboro", error=3.0).takes("error_length")
+    with pytest.raises(SystemCheckError, match=r"set terrain\.error_length"):
+        terrain_of(source="jacksboro", error=3.0, error_length=20e3)
 
 
 def test_what_hills_do_not_read_is_refused():
