@@ -106,8 +106,9 @@ GRID: dict[str, Any] = {
 }
 """Where the heights of a terrain lie: its first point, its spacing, and 1 where it is mirrored."""
 
-SURFACE: dict[str, Any] = {"shape": (7,)}
-"""What a terrain looks like to a radar: seed, strengths of its texture, bright points, detail."""
+SURFACE: dict[str, Any] = {"shape": (8,)}
+"""What a terrain looks like to a radar: seed, strengths of its texture, bright points, detail, and
+its cover, an index into terrafix.models.radar.cover.COVERS."""
 
 AMPLITUDE: dict[str, Any] = {"shape": (None, None), "dtype": np.float32}
 """Amplitude of a geocoded reference: rows, columns."""

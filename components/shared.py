@@ -35,6 +35,13 @@ def generator(component: Component, member: int | None = None) -> np.random.Gene
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
 
 
+def lasting_seed(component: Component) -> int:
+    """Seed of what a component draws once for a run: of the root seed and the component alone."""
+    env = component.environment
+    words = [env.seed & 0xFFFFFFFF, env.seed >> 32, *env.path.encode()]
+    return int(np.random.SeedSequence(words).generate_state(1)[0])
+
+
 def require_common(component: Component, *names: str) -> None:
     """Raise ConfigurationError if parameters differ between members; all of them by default."""
     declared = [n for n, s in component.settings().items() if isinstance(s, Parameter)]

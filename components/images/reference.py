@@ -5,7 +5,7 @@ A reference is one for all members, published by reference before the image that
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,17 +22,18 @@ from terrafix.components.sensors.files import (
     recorded_files,
     require_files,
 )
-from terrafix.components.shared import common, generator, require_common
+from terrafix.components.shared import common, generator, lasting_seed, require_common
 from terrafix.components.truth.terrain import scene_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Parameter, Text
+from terrafix.cosim.declare.parameters import Choice, Count, FilePath, Flag, Parameter, Text
 from terrafix.cosim.declare.ports import Input, MessageInput, SharedInput, SharedOutput
 from terrafix.models.core.arrays import Single
 from terrafix.models.geometry.geolocation import track_axes
 from terrafix.models.images.reference import Reference, earlier_pass, geocoded, read_reference
+from terrafix.models.images.rendered_reference import rendered
 from terrafix.models.maps.dem import Dem, dem_from
 from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.motion.sampled import SampledArc
@@ -41,6 +42,7 @@ from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.doppler import unwrapped_centroid
 from terrafix.models.radar.footprint import Footprint
 from terrafix.models.radar.imaging import Imager
+from terrafix.models.radar.scene import CoverMap, Scene
 from terrafix.models.sensors.aperture import LOOKS, side_of
 from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
@@ -150,10 +152,59 @@ class EarlierPass(_Reference):
                 beam.doppler(radar.wavelength),
                 side=beam.side,
             )
-            reference = earlier_pass(scene, footprint, looks, generator(self), float(snr))
+            reference = self._seen(scene, footprint, looks, float(snr))
         except ValueError as error:
             raise ConfigurationError(f"'{self.name}' cannot see its scene: {error}") from error
         self._publish(reference)
+
+    def _seen(
+        self, scene: Scene, footprint: Footprint, looks: tuple[int, int], snr_db: float
+    ) -> Reference:
+        return earlier_pass(scene, footprint, looks, generator(self), snr_db)
+
+
+class RenderedReference(EarlierPass):
+    """Reference that needs no earlier pass: rendered from known heights and a map of land cover.
+
+    It shows what amplitude is expected, without speckle, of the classes of the cover and of how
+    steep the known terrain faces the radar, for an orbit that is known beforehand: that of the
+    truth, displaced. The brightness of each class is off by an error that stays, and all of a
+    reference lies beside its place by another that is its own.
+    """
+
+    displacement = Parameter(
+        [1000.0, 1000.0, 500.0],
+        shape=(3,),
+        unit="m",
+        frame="track",
+        doc="of the orbit that was expected: along the track, to the right, up",
+    )
+    snr = Parameter(10.0, doc="mean clutter over thermal noise that is expected [dB]")
+    classes = Flag(True, doc="show land cover; false: relief alone")
+    class_sigma = Parameter(1.5, minimum=0.0, doc="error of each class's brightness [dB]")
+    placing_sigma = Parameter(
+        3.0, unit="m", minimum=0.0, doc="error of where map and heights lie, to the north and east"
+    )
+
+    height = SharedInput(**HEIGHT, doc="heights of the terrain, as they are known")
+    surface = SharedInput(**SURFACE, doc="what covers the ground")
+
+    def takes(self, name: str) -> bool:
+        """Whether a setting has any effect."""
+        return super().takes(name) and (name != "class_sigma" or bool(self.setting("classes")))
+
+    def _seen(
+        self, scene: Scene, footprint: Footprint, looks: tuple[int, int], snr_db: float
+    ) -> Reference:
+        cover = CoverMap(
+            **{f.name: getattr(scene, f.name) for f in fields(Scene)},
+            class_sigma=float(common(self, "class_sigma")),
+            map_seed=lasting_seed(self),
+        )
+        if not self.classes:
+            cover = replace(cover, cover="texture", class_sigma=0.0)
+        north, east = float(common(self, "placing_sigma")) * generator(self).standard_normal(2)
+        return rendered(cover, footprint, looks, snr_db, displaced=(north, east))
 
 
 class EarlierFlight(_Reference, OnGround):

@@ -25,12 +25,20 @@ from terrafix.models.maps.dem import (
     read_dem,
     read_jacksboro,
     rolling_dem,
+    roughened,
 )
+from terrafix.models.radar.cover import COVERS
 from terrafix.models.radar.scene import Scene
 
 _log = logging.getLogger(__name__)
 SOURCES = ("file", "jacksboro", "flat", "hills")
-_OF_HILLS = ("relief", "relief_length", "relief_seed", "error", "error_length", "error_seed")
+_UNREAD = {
+    "texture": ("parcels", "point_density", "point_brightness"),
+    "urban": ("point_density",),
+}
+"""What a cover has no use for."""
+_OF_HILLS = ("relief", "relief_length", "relief_seed")
+_OF_ERRORS = ("error_length", "error_seed")
 
 
 class Terrain(Component):
@@ -54,14 +62,20 @@ class Terrain(Component):
     relief_length = Parameter(150.0, unit="m", positive=True, doc="its correlation (hills)")
     relief_seed = Count(0, maximum=2**32, doc="of the heights (hills)")
     error = Parameter(
-        0.0, unit="m", minimum=0.0, doc="rms by which these are not the true heights (hills)"
+        0.0, unit="m", minimum=0.0, doc="rms by which these are not the true heights (not flat)"
     )
-    error_length = Parameter(150.0, unit="m", positive=True, doc="correlation of the error (hills)")
-    error_seed = Count(1, maximum=2**32, doc="of the error (hills)")
+    error_length = Parameter(150.0, unit="m", positive=True, doc="correlation of the error")
+    error_seed = Count(1, maximum=2**32, doc="of the error")
     mirrored = Flag(False, doc="go on for ever in mirror images: artificial, without borders")
     fill_voids = Flag(False, doc="interpolate voids, and say so, instead of refusing them")
     surface_seed = Count(0, maximum=2**53, doc="of texture and bright points")
     detail = Count(1, minimum=1, doc="how fine texture is: 1 from orbit, 10 from an aircraft")
+    cover = Choice(
+        COVERS,
+        "parcels",
+        doc="of the ground: parcels; texture, without borders and points; urban; coast; causeway, "
+        "in the sea; fields",
+    )
     parcels = Parameter(2.5, minimum=0.0, doc="texture with sharp borders, standard deviation [dB]")
     smooth = Parameter(1.5, minimum=0.0, doc="smooth texture, standard deviation [dB]")
     fine = Parameter(1.5, minimum=0.0, doc="fine texture, standard deviation [dB]")
@@ -70,7 +84,7 @@ class Terrain(Component):
 
     height = SharedOutput(**HEIGHT, doc="heights, southernmost row first")
     grid = SharedOutput(**GRID, doc="first point and spacing; whether mirrored")
-    surface = SharedOutput(**SURFACE, doc="seed, strength, points, detail of the texture")
+    surface = SharedOutput(**SURFACE, doc="seed, strength, points, detail, cover of the ground")
 
     def validate(self) -> None:
         """Read the elevation model."""
@@ -103,7 +117,20 @@ class Terrain(Component):
                 f"'{self.name}' is to mirror '{dem.name}', of which {dem.n_void} points are void\n"
                 f"  set {self.name}.fill_voids = true, or use another"
             )
-        return dem.tiled() if self.setting("mirrored") else dem
+        dem = dem.tiled() if self.setting("mirrored") else dem
+        return self._with_errors(dem)
+
+    def _with_errors(self, dem: Dem) -> Dem:
+        """What is known of the heights, where they are to be known with errors."""
+        rms, length = (float(shared_setting(self, name)) for name in ("error", "error_length"))
+        if not rms:
+            return dem
+        try:
+            return roughened(dem, rms, length, self.setting("error_seed"))
+        except ValueError as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot err: {error}\n  set {self.name}.error_length"
+            ) from error
 
     def _hills(self) -> Dem:
         """Artificial heights, and an error of them where one is asked for."""
@@ -123,9 +150,15 @@ class Terrain(Component):
 
     def takes(self, name: str) -> bool:
         """Whether a setting has any effect: heights of hills have where there are hills."""
+        if name in _UNREAD.get(self.setting("cover"), ()):
+            return False
         hills = self.setting("source") == "hills"
         if name in _OF_HILLS:
-            return hills and (not name.startswith("error_") or float(self.setting("error")) > 0)
+            return hills
+        if name == "error":
+            return bool(self.setting("source") != "flat")
+        if name in _OF_ERRORS:
+            return self.takes("error") and float(self.setting("error")) > 0
         return super().takes(name) and not (hills and name in ("mirrored", "fill_voids"))
 
     def _initialize_impl(self) -> None:
@@ -154,7 +187,12 @@ class Terrain(Component):
             self.point_brightness,
         )
         self.surface = np.array(
-            [float(self.surface_seed), *(float(s[0]) for s in strengths), float(self.detail)]
+            [
+                float(self.surface_seed),
+                *(float(s[0]) for s in strengths),
+                float(self.detail),
+                float(COVERS.index(self.cover)),
+            ]
         )
 
     def _step_impl(self, t: float, dt: float) -> None:
@@ -163,7 +201,7 @@ class Terrain(Component):
 
 def scene_from(height: Single, grid: FloatArray, surface: FloatArray) -> Scene:
     """What the ground looks like to a radar, from the ports of a terrain."""
-    seed, parcels, smooth, fine, density, brightness, detail = (float(s) for s in surface)
+    seed, *strengths, detail, cover = (float(s) for s in surface)
     return Scene(
-        dem_from(height, grid), int(seed), parcels, smooth, fine, density, brightness, int(detail)
+        dem_from(height, grid), int(seed), *strengths, detail=int(detail), cover=COVERS[int(cover)]
     )

@@ -281,6 +281,42 @@ def rolling_dem(rms: float, length: float, seed: int) -> Dem:
     return Dem(height, first, first, step, step, "rolling hills").tiled()
 
 
+def roughened(dem: Dem, rms: float, length: float, seed: int) -> Dem:
+    """The same with random errors of its heights, on its own points.
+
+    Errors a distance :math:`d` apart correlate by :math:`e^{-(d / L)^2}`; where points lie
+    farther apart than L, each has its own.
+
+    Parameters
+    ----------
+    dem : Dem
+    rms : float
+        Of the errors, whose mean over all points is zero [m].
+    length : float
+        L [m].
+    seed : int
+
+    Raises
+    ------
+    ValueError
+        If there are too few points within its borders to tell errors of this length.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    middle = sum(dem._span(0)) / 2
+    spacing = np.array([dem.latitude_step, dem.longitude_step * np.cos(middle)]) * EARTH.radius
+    if length > 0.5 * float((spacing * dem.height.shape).min()):
+        raise ValueError(
+            f"errors of heights {length:g} m long do not fit in {dem.name}, which is "
+            f"{float((spacing * dem.height.shape).min()):.0f} m wide"
+        )
+    noise = np.random.default_rng(seed).standard_normal(dem.height.shape)
+    errors = gaussian_filter(noise, length / 2 / spacing, mode="mirror")
+    errors -= errors.mean()
+    errors *= rms / errors.std()
+    return replace(dem, height=dem.height + errors.astype(np.float32))
+
+
 def _heights(raw: NDArray[Any], path: Path) -> Single:
     """Heights as a file holds them, voids as NaN; what the Earth does not have is refused."""
     height = np.array(raw, np.float32)

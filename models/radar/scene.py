@@ -4,10 +4,15 @@ Brightness is backscatter at the local angle of incidence :math:`\theta`,
 
 .. math:: \sigma_0(\theta) = \frac{0.0133 \cos\theta}{(\sin\theta + 0.1 \cos\theta)^3},
 
-times a texture: parcels with sharp borders, a smooth variation and a fine one, in decibels. Bright
-points (buildings, pylons) are strewn over it. Both are functions of (seed, place) alone, by
-counter-based noise on a grid of 1e-4 deg: any two images of a place, from whatever side, show the
-same texture and points, under speckle of their own.
+times a texture: parcels with sharp borders, a smooth variation and a fine one, in decibels; or
+fields, towns or sea in place of parcels (`terrafix.models.radar.cover`). Bright points (buildings,
+pylons) are strewn over it. All are functions of (seed, place) alone, by counter-based noise on a
+grid of 1e-4 deg: any two images of a place, from whatever side, show the same texture and points,
+under speckle of their own.
+
+Time changes it: of another season, texture is :math:`\rho` times the old one and
+:math:`\sqrt{1 - \rho^2}` times an independent one, in decibels, and a share :math:`1 - \rho` of
+the points is gone, and as many are new. Shores, streets and the borders of fields stay.
 
 References
 ----------
@@ -21,10 +26,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray, Single
 from terrafix.models.core.parallel import batches, over
 from terrafix.models.maps.dem import Dem
+from terrafix.models.radar import cover as patterns
+from terrafix.models.radar.cover import COVERS
 
 CELL = float(np.radians(1e-4))
 """Spacing of the texture in latitude and longitude [rad], some 11 m."""
@@ -39,6 +47,11 @@ _COARSE = 32
 """Cells between the samples of the parcels' and the smooth variation's noise."""
 _PARCEL, _SMOOTH, _FINE = 1.0, 3.0, 1.0
 """Standard deviations of the smoothing: of the first two in coarse cells, of the last in cells."""
+_MOTTLED, _MOTTLED_DB = 4.0, 3.4
+"""Smoothing [cells] and strength of the variation of a texture without borders: 4 dB in all."""
+_WITH_PARCELS = ("parcels", "coast", "causeway")
+_SHORE = ((3.2, 1.0), (1.0, 0.3), (4.0, 0.08))
+"""Smoothing (in coarse cells, the last in cells) and strength of what is zero along a shore."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +73,13 @@ class Scene:
         individual ones differ by 4 dB rms.
     detail : int
         How many times finer than `CELL` the texture is: 1 from orbit, 10 from an aircraft.
+    cover : str
+        What covers the ground, one of `COVERS`. `parcels_db` is that of fields and blocks, too; a
+        texture has neither parcels nor points; a town has points of its own density.
+    correlation : float
+        Of texture and points with those of `seed` alone, 0 to 1.
+    change_seed : int
+        Of what has changed.
     """
 
     dem: Dem
@@ -70,6 +90,9 @@ class Scene:
     points_per_km2: float = 3.0
     points_db: float = 25.0
     detail: int = 1
+    cover: str = "parcels"
+    correlation: float = 1.0
+    change_seed: int = 1
 
     @property
     def cell(self) -> float:
@@ -87,6 +110,10 @@ class Scene:
                 raise ValueError(f"{name} of a scene cannot be {getattr(self, name)}")
         if self.detail < 1:
             raise ValueError(f"detail of a scene cannot be {self.detail}: 1 is the coarsest")
+        if self.cover not in COVERS:
+            raise ValueError(f"cover of a scene is one of {', '.join(COVERS)}, not '{self.cover}'")
+        if not 0 <= self.correlation <= 1:
+            raise ValueError(f"correlation of a scene is 0 to 1, not {self.correlation}")
 
     def texture(self, rows: range, columns: range) -> Single:
         """Texture [dB] of cells, shape (len(rows), len(columns)).
@@ -110,17 +137,35 @@ class Scene:
         return parts[0] if len(parts) == 1 else np.hstack(parts)
 
     def _texture(self, rows: range, columns: range) -> Single:
-        fine = _smoothed_noise(self.seed, "fine", rows, columns, _FINE)
+        texture = self._on_land(self.seed, rows, columns)
+        if self.correlation < 1:
+            texture *= np.float32(self.correlation)
+            other = self._on_land(self.change_seed, rows, columns)
+            texture += np.float32(np.sqrt(1 - self.correlation**2)) * other
+        if self.cover == "urban":
+            texture[self._streets(rows, columns)] += np.float32(patterns.STREET_DB)
+        sea = np.float32(patterns.SEA_DB) + np.float32(patterns.CALM) * texture
+        return self._with_sea(texture, sea, rows, columns)
+
+    def _on_land(self, seed: int, rows: range, columns: range) -> Single:
+        """What changes with the seasons [dB]."""
+        fine = _smoothed_noise(seed, "fine", rows, columns, _FINE)
         fine *= np.float32(self.fine_db)
+        if self.cover in ("urban", "fields"):
+            fine += np.float32(self.parcels_db) * self._rectangles(seed, rows, columns)
+        if self.cover == "texture":
+            mottled = _smoothed_noise(seed, "mottled", rows, columns, _MOTTLED)
+            fine += np.float32(_MOTTLED_DB) * mottled
         # whole coarse cells that cover the rectangle
-        ci, cj = (range(r.start // _COARSE - 2, r.stop // _COARSE + 4) for r in (rows, columns))
+        ci, cj = _coarse_cells(rows, columns)
         coarse = [
-            (name, scale, _smoothed_noise(self.seed, name, ci, cj, sigma))
+            (name, scale, _smoothed_noise(seed, name, ci, cj, sigma))
             for name, sigma, scale in (
                 ("parcels a", _PARCEL, self.parcels_db / np.sqrt(2)),
                 ("parcels b", _PARCEL, self.parcels_db / np.sqrt(2)),
                 ("smooth", _SMOOTH, self.smooth_db),
             )
+            if name == "smooth" or self.cover in _WITH_PARCELS
         ]
 
         def add(part: slice) -> None:
@@ -131,6 +176,40 @@ class Scene:
 
         over(batches(len(rows), 256), add)
         return fine
+
+    def _rectangles(self, seed: int, rows: range, columns: range) -> Single:
+        """Brightness of blocks or fields, in standard deviations."""
+        at = patterns.districts(self.seed, rows, columns, self.cell)
+        own = patterns.streets(at)[1] if self.cover == "urban" else patterns.fields(at)
+        return np.asarray(patterns.CROPS[patterns.crops(seed, own)])
+
+    def _streets(self, rows: range, columns: range) -> NDArray[np.bool_]:
+        return patterns.streets(patterns.districts(self.seed, rows, columns, self.cell))[0]
+
+    def _with_sea(
+        self, texture: Single, sea: Single | np.float32, rows: range, columns: range
+    ) -> Single:
+        """Texture on land and that of the sea, in what mixture cells have of them [dB]."""
+        land = self._land(rows, columns)
+        if land is None:
+            return texture
+        to_power = np.float32(np.log(10) / 10)
+        power = land * np.exp(texture * to_power) + (1 - land) * np.exp(sea * to_power)
+        return np.asarray(np.log(power) / to_power)
+
+    def _land(self, rows: range, columns: range) -> Single | None:
+        """Share of cells that are land; None where all are."""
+        if self.cover == "causeway":
+            return patterns.causeway(self.seed, rows, columns, self.cell)
+        if self.cover != "coast":
+            return None
+        ci, cj = _coarse_cells(rows, columns)
+        (broad, scale), (close, less), (fine, least) = _SHORE
+        coarse = np.float32(scale) * _smoothed_noise(self.seed, "shore", ci, cj, broad)
+        coarse += np.float32(less) * _smoothed_noise(self.seed, "bays", ci, cj, close)
+        level = np.float32(least) * _smoothed_noise(self.seed, "rocks", rows, columns, fine)
+        level += _enlarged(coarse, ci, cj, rows, columns)
+        return np.asarray(level > 0, np.float32)
 
     def points(
         self, rows: range, columns: range
@@ -146,27 +225,109 @@ class Scene:
         phase : ndarray, shape (n,)
             Of the reflection [cycles].
         """
-        found = [
-            self._points(rows, part, turn) for part, turn in _within_a_turn(columns, self._turn)
-        ]
-        latitude, longitude, amplitude, phase = np.hstack(found)
-        return latitude, longitude, amplitude, phase
+        found = []
+        for part, turn in _within_a_turn(columns, self._turn):
+            own = self._points(self.seed, rows, part, self.correlation)
+            if self.correlation < 1:
+                new = self._points(self.change_seed, rows, part, 1 - self.correlation)
+                own = np.hstack([own, new])
+            own[1] += turn * self._turn
+            found.append(own)
+        i, j, amplitude, phase = np.hstack(found)
+        return i * self.cell, j * self.cell, amplitude, phase
 
-    def _points(self, rows: range, columns: range, turn: int) -> FloatArray:
+    def _points(self, seed: int, rows: range, columns: range, share: float) -> FloatArray:
+        """Row, column, amplitude and phase of a share of the points of a seed, shape (4, n)."""
+        if self.cover == "texture":
+            return np.empty((4, 0))
         found = []
         for bi in range(rows.start // _BLOCK, -(-rows.stop // _BLOCK)):
             for bj in range(columns.start // _BLOCK, -(-columns.stop // _BLOCK)):
-                rng = _generator(self.seed, "points", bi, bj)
-                middle = (bi + 0.5) * _BLOCK * self.cell
-                area = (_BLOCK * self.cell * 6371.0) ** 2 * np.cos(middle)
-                n = rng.poisson(max(area, 0.0) * self.points_per_km2)
+                rng = _generator(seed, "points", bi, bj)
+                n = rng.poisson(self._n_points(bi))
                 place = rng.random((2, n)) * _BLOCK + np.array([[bi], [bj]]) * _BLOCK
                 db = self.points_db + 4.0 * rng.standard_normal(n)
-                found.append(np.vstack([place, 10 ** (db / 20), rng.random(n)]))
-        i, j, amplitude, phase = np.hstack(found) if found else np.empty((4, 0))
+                points = np.vstack([place, 10 ** (db / 20), rng.random(n)])
+                found.append(points if share == 1 else points[:, rng.random(n) < share])
+        points = np.hstack(found) if found else np.empty((4, 0))
+        i, j = points[:2]
         inside = (i >= rows.start) & (i < rows.stop) & (j >= columns.start) & (j < columns.stop)
-        j = j + turn * self._turn
-        return np.stack([i * self.cell, j * self.cell, amplitude, phase])[:, inside]
+        return self._built(points[:, inside], rows, columns)
+
+    def _n_points(self, bi: int) -> float:
+        """Expected number of points in a block of cells."""
+        middle = (bi + 0.5) * _BLOCK * self.cell
+        if self.cover == "urban":
+            return max(float(_BLOCK**2 * np.cos(middle)), 0.0) * patterns.DENSE / patterns.BUILT
+        area = (_BLOCK * self.cell * 6371.0) ** 2 * np.cos(middle)
+        return max(float(area), 0.0) * self.points_per_km2
+
+    def _built(self, points: FloatArray, rows: range, columns: range) -> FloatArray:
+        """Those that do not stand on a street or in the sea."""
+        if self.cover not in ("urban", "coast", "causeway") or not points.size:
+            return points
+        wide = [range(r.start, r.stop + 1) for r in (rows, columns)]
+        if self.cover == "urban":
+            free = ~self._streets(*wide)
+        else:
+            land = self._land(*wide)
+            assert land is not None
+            free = land > 0.5
+        i, j = (np.rint(p).astype(np.int64) - r.start for p, r in zip(points, wide, strict=False))
+        return points[:, free[i, j]]
+
+
+@dataclass(frozen=True, eq=False)
+class CoverMap(Scene):
+    """What a land-cover map tells of a scene: borders of classes, and how bright a class is.
+
+    It knows no fine and smooth variation and no single building, and the brightness of each class
+    is off by an error of its own. The classes of a town are block and street, those of fields and
+    parcels kinds of them.
+
+    Parameters
+    ----------
+    class_sigma : float
+        Standard deviation of the errors of brightness [dB].
+    map_seed : int
+        Of these errors.
+    """
+
+    class_sigma: float = 0.0
+    map_seed: int = 0
+
+    def points(
+        self, rows: range, columns: range
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """No points."""
+        empty = np.empty(0)
+        return empty, empty, empty, empty
+
+    def _texture(self, rows: range, columns: range) -> Single:
+        kind, levels = self._classes(rows, columns)
+        errors = _generator(self.map_seed, "classes").standard_normal(len(levels) + 1)
+        errors *= self.class_sigma
+        texture = (levels + errors[:-1]).astype(np.float32)[kind]
+        sea = np.float32(patterns.SEA_DB + errors[-1])
+        return self._with_sea(texture, sea, rows, columns)
+
+    def _classes(self, rows: range, columns: range) -> tuple[NDArray[np.int64], FloatArray]:
+        """Class of each cell, and the mean brightness of each class [dB]."""
+        shape = len(rows), len(columns)
+        if self.cover == "texture":
+            return np.zeros(shape, np.int64), np.zeros(1)
+        if self.cover == "urban":
+            return self._streets(rows, columns).astype(np.int64), np.array([0, patterns.STREET_DB])
+        if self.cover == "fields":
+            at = patterns.districts(self.seed, rows, columns, self.cell)
+            kinds = patterns.crops(self.seed, patterns.fields(at))
+            return kinds, self.parcels_db * patterns.CROPS
+        ci, cj = _coarse_cells(rows, columns)
+        kinds = np.zeros(shape, np.int64)
+        for weight, name in ((2, "parcels a"), (1, "parcels b")):
+            field = _smoothed_noise(self.seed, name, ci, cj, _PARCEL)
+            kinds += weight * (_enlarged(field, ci, cj, rows, columns) > 0)
+        return kinds, self.parcels_db / np.sqrt(2) * np.array([-2.0, 0.0, 0.0, 2.0])
 
 
 def _within_a_turn(columns: range, around: int) -> list[tuple[range, int]]:
@@ -197,6 +358,12 @@ def brightness(cosine: FloatArray) -> FloatArray:
     power = c / (s + 0.1 * c) ** 3 / s
     c0, s0 = np.cos(_REFERENCE_INCIDENCE), np.sin(_REFERENCE_INCIDENCE)
     return np.asarray(power * (s0 + 0.1 * c0) ** 3 * s0 / c0)
+
+
+def _coarse_cells(rows: range, columns: range) -> tuple[range, range]:
+    """Whole coarse cells that cover a rectangle of cells."""
+    ci, cj = (range(r.start // _COARSE - 2, r.stop // _COARSE + 4) for r in (rows, columns))
+    return ci, cj
 
 
 def _generator(seed: int, name: str, *block: int) -> np.random.Generator:

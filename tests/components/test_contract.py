@@ -29,6 +29,7 @@ TYPES = sorted(n for n, e in component_entries().items() if e.value.startswith("
 IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("earlier_pass", "image_album", "image_former", "image_matcher"),
     *("recorded_echo", "recorded_reference", "reference_file", "scene_echo", "terrain"),
+    "rendered_reference",
     *("aircraft_radar", "aperture_former", "aperture_matcher"),
     "earlier_flight",  # in systems/test_aircraft_sar
     *("recorded_spotlight", "spotlight_matcher", "spotlight_evaluation"),  # in test_aircraft_gotcha

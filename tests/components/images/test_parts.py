@@ -8,7 +8,7 @@ import pytest
 from terrafix.components.images import reference
 from terrafix.components.images.image_former import ImageFormer
 from terrafix.components.images.matcher import ImageMatcher
-from terrafix.components.images.reference import EarlierPass
+from terrafix.components.images.reference import EarlierPass, RenderedReference
 from terrafix.components.sensors import echo
 from terrafix.components.sensors.echo import SceneEcho
 from terrafix.components.shared import generator
@@ -50,7 +50,7 @@ def bound(component, name, seed=0, **views):
 def surface_views():
     dem = flat_dem(100.0)
     grid = np.array([0.0, 0.0, 1.0, 1.0, 1.0])
-    shared = {"height": dem.height, "grid": grid, "surface": np.array([1.0, 0, 0, 0, 0, 0, 1])}
+    shared = {"height": dem.height, "grid": grid, "surface": np.array([1.0, 0, 0, 0, 0, 0, 1, 0])}
     return {k: SimpleNamespace(value=v) for k, v in shared.items()}
 
 
@@ -147,6 +147,34 @@ def test_the_earlier_pass_flew_where_it_is_said_to(monkeypatch):
     assert made["middle"] == pytest.approx(beam.slant_range, abs=1e-3)
     assert made["time"] == pytest.approx(0.0, abs=1e-12)
     assert made["side"] == 1
+
+
+def test_a_rendered_reference_errs_as_it_is_said_to():
+    """By one error of brightness for a run, and by another of places for each image."""
+    views = surface_views() | {"radar": SimpleNamespace(value=np.array([*RADAR.values()]))}
+    views["surface"] = SimpleNamespace(value=np.array([1.0, 2.5, 0, 0, 0, 0, 1, 5]))
+
+    def drawn(step, seed=0, **settings):
+        made = RenderedReference(look=LOOK, n_lines=400, n_cells=200, **settings)
+        bound(made, "reference", seed, **views, **motion())
+        made.step_index = step
+        published = {}
+        made._publish = lambda reference: published.update(reference=reference)
+        made.step(8.2, 8.2)
+        return published["reference"]
+
+    one, next_one, other = drawn(1), drawn(2), drawn(1, seed=5)
+    exact = drawn(1, class_sigma=0.0, placing_sigma=0.0)
+    assert one.amplitude.shape == (200, 200)
+    np.testing.assert_array_equal(one.amplitude, next_one.amplitude)
+    assert np.abs(np.log(one.amplitude / exact.amplitude)).max() > 0.05
+    assert np.abs(np.log(one.amplitude / other.amplitude)).max() > 0.05
+    moved = [(r.latitude - exact.latitude)[0, 0] * 6.36e6 for r in (one, next_one, other)]
+    assert len(set(moved)) == 3
+    assert max(map(abs, moved)) < 4 * 3.0  # [m]
+    relief = drawn(1, classes=False)
+    assert np.ptp(relief.amplitude) < 0.1 < np.ptp(exact.amplitude)
+    assert not RenderedReference(look=LOOK, classes=False).takes("class_sigma")
 
 
 def believing(**settings):

@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from terrafix.components.truth.terrain import Terrain
+from terrafix.components.truth.terrain import Terrain, scene_from
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.system import System
@@ -43,7 +43,7 @@ def test_a_terrain_without_a_file_is_a_problem_of_the_check():
 
 def terrain_of(**settings):
     system = System("ground")
-    system.add(Terrain(source="hills", **settings), name="terrain")
+    system.add(Terrain(**{"source": "hills"} | settings), name="terrain")
     simulation = Simulation(system)
     simulation.run_until("0")
     return np.array(system.nodes["terrain"].height)
@@ -56,6 +56,20 @@ def test_heights_that_are_not_the_true_ones_are_off_by_their_error():
     assert np.array_equal(true, terrain_of())
 
 
+def test_heights_of_any_source_but_a_flat_one_can_err():
+    """As hills: 3 m rms. And a border of the model is too near for errors 20 km long."""
+    true, known = (
+        terrain_of(source="jacksboro", mirrored=True, **settings)
+        for settings in ({}, {"error": 3.0, "error_length": 300.0})
+    )
+    assert (known - true).std() == pytest.approx(3.0, rel=1e-4)
+    assert not Terrain(source="flat").takes("error")
+    assert not Terrain(source="jacksboro").takes("error_length")
+    assert Terrain(source="jacksboro", error=3.0).takes("error_length")
+    with pytest.raises(SystemCheckError, match=r"set terrain\.error_length"):
+        terrain_of(source="jacksboro", error=3.0, error_length=20e3)
+
+
 def test_what_hills_do_not_read_is_refused():
     terrain = Terrain(source="hills")
     assert terrain.takes("relief")
@@ -64,3 +78,15 @@ def test_what_hills_do_not_read_is_refused():
     assert not Terrain(source="flat").takes("relief")
     with pytest.raises(SystemCheckError, match=r"set terrain\.relief_length"):
         terrain_of(relief_length=5.0)
+
+
+def test_what_covers_the_ground_is_told_and_what_it_has_no_use_for_is_refused():
+    system = System("ground")
+    terrain = system.add(Terrain(source="flat", cover="coast", surface_seed=4), name="terrain")
+    Simulation(system).run_until("0")
+    scene = scene_from(terrain.height, terrain.grid, terrain.surface)
+    assert (scene.cover, scene.seed, scene.points_db, scene.detail) == ("coast", 4, 25.0, 1)
+    assert terrain.takes("point_density")
+    assert not Terrain(source="flat", cover="texture").takes("parcels")
+    assert not Terrain(source="flat", cover="urban").takes("point_density")
+    assert Terrain(source="flat", cover="urban").takes("point_brightness")

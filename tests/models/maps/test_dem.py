@@ -13,6 +13,7 @@ from terrafix.models.maps.dem import (
     read_hgt,
     read_jacksboro,
     rolling_dem,
+    roughened,
     write_dem,
 )
 
@@ -240,3 +241,19 @@ def test_rolling_hills_are_as_high_and_as_long_as_asked_for():
     assert not np.array_equal(h, rolling_dem(10.0, 150.0, 5).height)
     with pytest.raises(ValueError, match="hills are 30 to 2560 m long, not 20 m"):
         rolling_dem(10.0, 20.0, 4)
+
+
+def test_errors_of_heights_are_as_large_and_as_long_as_asked_for():
+    """5 m rms to float32; a distance L apart they correlate by 1/e, 3 L apart by chance."""
+    step = np.radians(1.0) / 3600  # 31 m at the equator
+    plain = Dem(np.full((400, 400), 1000.0, np.float32), 0.0, 0.0, step, step).tiled()
+    errors = np.asarray(roughened(plain, 5.0, 309.0, 2).height - plain.height, np.float64)
+    assert errors.std() == pytest.approx(5.0, rel=1e-4)
+
+    def correlation(k):
+        return np.mean(errors[:, k:] * errors[:, : 400 - k]) / errors.var()
+
+    assert correlation(10) == pytest.approx(np.exp(-1.0), abs=0.1)
+    assert abs(correlation(30)) < 0.15
+    with pytest.raises(ValueError, match="10000 m long do not fit"):
+        roughened(plain, 5.0, 10e3, 2)

@@ -1,0 +1,101 @@
+"""Images recognized on references that no radar has seen, rendered from what is known beforehand.
+
+    python benchmarks/rendered_reference.py [--images 60] [--cover parcels] [--classes 1]
+
+Every image has a place, a surface, speckle and an orbit of its own; what is known of the terrain,
+of each class's brightness and of where both lie errs anew. Printed are the share that is
+recognized, the errors of what was accepted, in pixels of the reference and in meters on the ground,
+and their standard errors as `place_sigma` tells them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+
+import numpy as np
+from passes import EARTH, HEADING, INCIDENCE, LOOKS, footprint, found, seen
+
+from terrafix.models.images.rendered_reference import place_sigma, rendered
+from terrafix.models.maps.dem import Dem, read_jacksboro, roughened
+from terrafix.models.radar.scene import CoverMap, Scene
+
+SIZE, AROUND = (480, 600), (1000, 1100)
+"""Rows and columns of images and of references."""
+
+
+def trial(number: int, dem: Dem, options: argparse.Namespace) -> dict[str, object]:
+    """One image."""
+    rng = np.random.default_rng([20191, number])
+    place = np.radians(rng.uniform([25.0, -100.0], [45.0, -60.0]))
+    seed = int(rng.integers(2**31))
+    turn = HEADING + np.pi * rng.integers(2)  # ascending or descending
+    true = footprint(dem, place, SIZE, heading=turn)
+    image = seen(Scene(dem, seed=seed, cover=options.cover), true, rng)
+    known = dem
+    if options.height:
+        known = roughened(dem, options.height, options.length, number)
+    cover = CoverMap(
+        known, seed=seed, cover=options.cover, class_sigma=options.brightness, map_seed=number
+    )
+    if not options.classes:
+        cover = CoverMap(known, cover="texture")
+    displaced = options.placing * rng.standard_normal(2)
+    # the orbit that is expected is 1 km off, in heading and incidence by what that makes
+    off = 1000.0 * rng.standard_normal(2) / EARTH_RADIUS
+    planned = footprint(known, place + off, AROUND, heading=turn, off=600 * rng.standard_normal(3))
+    reference = rendered(cover, planned, LOOKS, displaced=tuple(displaced))
+    match = found(image, reference)
+    row, column, inside = reference.pixel(image.place[0], image.place[1])
+    out = {"accepted": match.accepted, "reason": match.reason, "inside": bool(inside)}
+    if match.accepted:
+        latitude, longitude, _ = reference.place(match.row, match.column)
+        height = float(known.at(latitude, longitude))
+        true_p = EARTH.point(*image.place)
+        north, east, down = EARTH.axes(true_p)
+        off_m = EARTH.point(latitude, longitude, height) - true_p
+        n, e, d = (float(off_m @ a) for a in (north, east, down))
+        ahead = np.array([np.cos(turn), np.sin(turn)])
+        right = np.array([-np.sin(turn), np.cos(turn)])
+        out["pixels"] = (match.row - float(row), match.column - float(column))
+        out["meters"] = (ahead @ [n, e], right @ [n, e], -d)
+        out["sigma"] = match.sigma
+    return out
+
+
+EARTH_RADIUS = 6371e3
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--images", type=int, default=60)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--cover", default="parcels")
+    parser.add_argument("--height", type=float, default=5.0, help="rms error of heights [m]")
+    parser.add_argument("--length", type=float, default=300.0, help="its correlation [m]")
+    parser.add_argument("--classes", type=int, default=1, help="0: relief alone")
+    parser.add_argument("--brightness", type=float, default=1.5, help="error of classes [dB]")
+    parser.add_argument("--placing", type=float, default=3.0, help="error of places [m]")
+    options = parser.parse_args()
+    start, dem = time.process_time(), read_jacksboro().tiled()
+    outcomes = [
+        trial(k, dem, options) for k in range(options.first, options.first + options.images)
+    ]
+    right = [o for o in outcomes if o["accepted"]]
+    pixels, meters = (np.array([o[k] for o in right]) for k in ("pixels", "meters"))
+    print(f"{len(right)} of {len(outcomes)} recognized, {time.process_time() - start:.0f} s")
+    print(Counter(str(o["reason"]) for o in outcomes))
+    if len(right) < 2:
+        return
+    wrong = np.hypot(*pixels.T)
+    print(f"beyond 1.5 and 3 pixels: {(wrong > 1.5).sum()}, {(wrong > 3).sum()}")
+    for name, values in (("pixels", pixels), ("meters", meters)):
+        rms = np.sqrt((values**2).mean(axis=0))
+        print(f"{name}: mean {values.mean(axis=0).round(2)}, rms {rms.round(2)}")
+    print("expected of map and heights", place_sigma(INCIDENCE, options.placing, options.height, 0))
+
+
+if __name__ == "__main__":
+    main()
