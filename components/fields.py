@@ -79,6 +79,9 @@ IMAGE = {
     "velocity": Field((), "m/s", doc="effective velocity that focuses it"),
     "velocity_sigma": Field((), "m/s", doc="standard error of that velocity"),
     "focused": Field((), "1", doc="1 where autofocus named that velocity, 0 where it refused"),
+    "row_time": Field((), "s", doc="from row to row, when the beam's center passes"),
+    "column_range": Field((), "m", doc="slant range from column to column"),
+    "time_sigma": Field((), "s", doc="standard error of the times of its rows"),
     "side": Field((), "1", doc="1: to the right of the track, -1: to the left"),
 }
 """An image formed with a member's own estimate."""

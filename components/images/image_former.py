@@ -169,6 +169,11 @@ class ImageFormer(Component):
         values["slant_range"] = beam_range + self.range_sigma * noise
         speed = np.linalg.norm(self.prior.v_e, axis=1)
         values["sine"] = wavelength * beam_doppler / (2 * speed)
+        values["row_time"] = np.full(self.n_members, self.azimuth_looks / imager.radar.prf)
+        values["column_range"] = np.full(
+            self.n_members, self.range_looks * imager.radar.range_spacing
+        )
+        values["time_sigma"] = self.acquired.time_sigma
         values["side"] = self.acquired.side
         self.images = np.stack(chips)
         self.image.publish(t, valid=formed, **values)

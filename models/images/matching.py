@@ -59,6 +59,8 @@ REASONS = (
     "its parts do not agree on where it lies",
     "too little in it holds it in place",
     "it lies farther off than the prediction can be",
+    "what is estimated sees no ground",
+    "its place has no height",
 )
 """What became of an image."""
 
@@ -83,9 +85,9 @@ _LOBE = 6
 """Half the side of a peak: no other is counted there [searched pixels]."""
 _SPACINGS = 16
 """Peaks that the first one is held against."""
-_AMBIGUOUS = 1e-3
+_AMBIGUOUS = 1e-5
 """Chance that the highest of wrong peaks stands out so much: at most."""
-_CHANCE = 1e-6
+_CHANCE = 1e-7
 """Chance of that and of so many parts that agree with it: at most."""
 _CORNERS = 6.0
 """Most that a turn or stretch moves the image's corners between those tried [pixels]."""
@@ -355,19 +357,20 @@ def matched(
     c = middle if center is None else np.asarray(center, np.float64)
     drawn = _drawn(image.shape, reference, predicted)
     if drawn is None:
-        return _refused("it lies beyond the edge of the reference")
+        return refused("it lies beyond the edge of the reference")
     peak = _searched(image, drawn, predicted)
     if peak is None:
-        return _refused("no place stands out of the others")
+        return refused("no place stands out of the others")
     if peak.chance > _AMBIGUOUS:
-        return _refused("no place stands out of the others", peak.chance)
+        return refused("no place stands out of the others", peak.chance)
     aligned = _aligned(image, drawn, predicted, peak, c)
     if aligned is None:
-        return _refused("too little in it holds it in place", peak.chance)
+        return refused("too little in it holds it in place", peak.chance)
     return _judged(image, drawn, predicted, peak, aligned, c)
 
 
-def _refused(reason: str, chance: float = 1.0) -> Match:
+def refused(reason: str, chance: float = 1.0) -> Match:
+    """No match, for one of `REASONS`."""
     return Match(np.nan, np.nan, np.full((2, 2), np.nan), False, reason, chance=chance)
 
 
@@ -425,11 +428,16 @@ def _far(shift: FloatArray, covariance: FloatArray) -> bool:
     return bool(shift @ np.linalg.solve(covariance, shift) > (_SIGMAS + 1) ** 2)
 
 
+def searched_span(n: int, sigma: float) -> tuple[int, int]:
+    """Rows, or columns, that are searched about an image of `n` for a sigma of its shift."""
+    reach = int(np.ceil(_SIGMAS * sigma)) + _MARGIN
+    return -reach, n + reach
+
+
 def _drawn(shape: tuple[int, int], reference: Searchable, predicted: Prediction) -> _Drawn | None:
     """The reference in the frame of the image, as far as it may be shifted and is there."""
-    sigma = np.sqrt(np.diag(predicted.covariance))
-    reach = np.ceil(_SIGMAS * sigma).astype(int) + _MARGIN
-    spans = [(-int(r), n + int(r)) for r, n in zip(reach, shape, strict=True)]
+    sigmas = np.sqrt(np.diag(predicted.covariance))
+    spans = [searched_span(n, float(s)) for n, s in zip(shape, sigmas, strict=True)]
     axes = [np.arange(low, high + 8, 8.0) for low, high in spans]
     inside = _inside(predicted.at(*axes), reference.shape)
     if not inside.any():
@@ -553,10 +561,10 @@ def _standing_out(
     i, j = (int(k) for k in np.unravel_index(where.argmax(), where.shape))
     if not (0 < i < surface.shape[0] - 1 and 0 < j < surface.shape[1] - 1) or where[i, j] <= 0:
         return None
-    others = surface.copy()
-    others[max(i - _LOBE, 0) : i + _LOBE + 1, max(j - _LOBE, 0) : j + _LOBE + 1] = 0
     side = np.ones((2 * _LOBE + 1, 2 * _LOBE + 1), np.uint8)
-    tops = others[(others >= cv2.dilate(others, side)) & (others > 0)]
+    highest = (surface >= cv2.dilate(surface, side)) & (surface > 0)
+    highest[max(i - _LOBE, 0) : i + _LOBE + 1, max(j - _LOBE, 0) : j + _LOBE + 1] = False
+    tops = surface[highest]
     E = np.sort(tops)[::-1][: _SPACINGS + 1].astype(np.float64) ** 2
     if len(E) < 3:
         return None

@@ -179,9 +179,11 @@ class Reference:
         return coefficients if miss.max() < _NO_POLYNOMIAL else None
 
     def pixel(
-        self, latitude: ArrayLike, longitude: ArrayLike
+        self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike | None = None
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Row and column, fractional, of places [rad], and whether they are inside: of `place`.
+        """Row and column, fractional, of places [rad], and whether they are inside.
+
+        Of `place`; of places whose height is given, as `place_on` finds them.
 
         Solved by Newton's method with the mean slope of the tie points, which relief bends by less
         than a half; where it does not settle (layover), a place counts as outside.
@@ -189,7 +191,10 @@ class Reference:
         Parameters
         ----------
         latitude, longitude : array_like, shape (...)
+        height : array_like, shape (...), optional
+            Of the places [m].
         """
+        coefficients = None if height is None else self._by_height
         wanted = np.stack([np.asarray(latitude), self.own_turn(longitude)], axis=-1)
         i, j = np.meshgrid(self.rows, self.columns, indexing="ij")
         ties = np.stack([np.ones_like(i), i, j], axis=-1).reshape(-1, 3)
@@ -202,7 +207,11 @@ class Reference:
         high = np.array([self.rows[-1], self.columns[-1]])
         for _ in range(_ROUNDS):
             held = np.clip(pixel, low, high)
-            found = np.stack(self.place(held[..., 0], held[..., 1])[:2], axis=-1)
+            if coefficients is None:
+                found = np.stack(self.place(held[..., 0], held[..., 1])[:2], axis=-1)
+            else:
+                terms = self._terms(held[..., 0], held[..., 1], np.asarray(height, np.float64))
+                found = terms @ coefficients
             change = (wanted - found) @ inverse
             pixel = held + change
             inside = np.all((pixel >= low) & (pixel <= high), axis=-1)
