@@ -2,9 +2,15 @@
 
 It reads the prior of its own instant, so that the image that corrects an estimate was formed with
 that estimate. Members whose estimates lead to the same focus share the image.
+
+A member whose estimate leads to no image goes without one this time, and `reason` says why: the
+next echo may show what this one does not. A member is failed only where its settings and the echo's
+size are at fault, as they will be the next time.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,21 +27,47 @@ from terrafix.cosim.declare.ports import (
     Input,
     MessageInput,
     MessageOutput,
+    Output,
     SharedInput,
     SharedOutput,
 )
 from terrafix.models.core.arrays import Single
 from terrafix.models.geometry.antenna import boresight_direction_array, nominal_antenna_array
-from terrafix.models.geometry.geolocation import ground_point
+from terrafix.models.radar.autofocus import Focus
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.doppler import centroid_candidates
 from terrafix.models.radar.focusing import Image
-from terrafix.models.radar.imaging import Imager, Processing, chip_slices
+from terrafix.models.radar.imaging import (
+    BLIND,
+    OPEN,
+    REASONS,
+    ZERO,
+    Imager,
+    NoImageError,
+    Processing,
+    chip_slices,
+)
 from terrafix.models.radar.multilook import detected, multilook_index
-from terrafix.models.sensors.effective_velocity import effective_velocity_array
+from terrafix.models.sensors.effective_velocity import VelocityField, velocity_field
 
-_HALF_SWATH = 3000.0
-"""Slant range over which the growth of velocity is taken [m]."""
+_SIGMAS = 5.0
+"""How far from the estimate the velocity is looked for, in standard deviations."""
+_FARTHEST = 300.0
+"""At most [m/s]."""
+_MOST_CENTROIDS = 12
+"""That an estimate may leave open: an echo is focused with each."""
+
+
+@dataclass(frozen=True)
+class _Formed:
+    """An image as a member's estimate and autofocus form it."""
+
+    image: Image
+    processing: Processing
+    focus: Focus
+    velocity: float
+    sigma: float
+    own: float
 
 
 class ImageFormer(Component):
@@ -66,8 +98,12 @@ class ImageFormer(Component):
     rows = Count(500, minimum=96, doc="of the detected image")
     columns = Count(500, minimum=96, doc="of the detected image")
     range_sigma = Parameter(1.0, unit="m", minimum=0.0, doc="noise of the slant range")
-    velocity_sigma = Parameter(
-        0.3, unit="m/s", positive=True, doc="error of the velocity beyond what the image tells"
+    height_sigma = Parameter(
+        100.0,
+        unit="m",
+        minimum=0.0,
+        doc="of heights of the terrain, from that of the beam's center: what focuses has another "
+        "effective velocity there",
     )
     show_unfocused = Flag(False, doc="publish the first member's image before autofocus, too")
 
@@ -84,11 +120,13 @@ class ImageFormer(Component):
         (None, None), dtype=np.float32, doc="the first member's, as its estimate alone forms it"
     )
     image = MessageOutput(fields=IMAGE, doc="which image is a member's, and what it measures")
+    reason = Output(doc="of the last echo: index into terrafix.models.radar.imaging.REASONS")
 
     def initialize(self) -> None:
         """Look whether what forms images is common to all members."""
         require_common(self, "velocity_step", "migration_step", "band", "exposure")
         super().initialize()
+        self.reason = np.nan
 
     def _step_impl(self, t: float, dt: float) -> None:
         fresh = self.acquired.fresh & self.environment.active
@@ -101,9 +139,15 @@ class ImageFormer(Component):
                     f"'{self.name}.acquired.{name}' differs between members, but one echo is "
                     "shared by all of them\n  fly one member at a time"
                 )
+        if not np.any(self.echo):
+            self.reason = np.where(fresh, REASONS.index(ZERO), self.reason)
+            return
         self._require_side(fresh)
+        self._form(t, self._imager(k), fresh)
+
+    def _imager(self, k: int) -> Imager:
         try:
-            imager = Imager(
+            return Imager(
                 self.echo,
                 Radar(*map(float, self.radar)),
                 float(self.acquired.near_range[k]),
@@ -114,72 +158,99 @@ class ImageFormer(Component):
                 exposure=float(self.exposure[k]),
                 operations=row_operations(),
             )
-            self._form(t, imager, fresh)
         except ValueError as error:
             raise ConfigurationError(
                 f"'{self.name}' cannot form an image of {self.echo.shape[0]} lines of "
-                f"{self.echo.shape[1]} cells: {error}\n"
-                f"  receive more lines or cells, or set {self.name}.rows and {self.name}.columns"
+                f"{self.echo.shape[1]} cells: {error}"
             ) from error
 
     def _form(self, t: float, imager: Imager, fresh: Mask) -> None:
         wavelength = imager.radar.wavelength
         centroid, sigma = self._expected_centroid(wavelength)
-        beam_range, beam_doppler = self.acquired.beam_range, self.acquired.beam_doppler
         chips: list[Single] = []
         known: dict[tuple[Processing, float], int] = {}
         values = {name: np.zeros(self.n_members) for name in IMAGE}
         formed = np.zeros(self.n_members, np.bool_)
         for m in map(int, np.flatnonzero(fresh)):
-            beam = float(beam_range[m]), float(beam_doppler[m])
             try:
-                velocity, slope = self._expected_velocity(m, wavelength)
-                processings = [
-                    imager.processing(f, velocity, slope)
-                    for f in centroid_candidates(
-                        imager.fraction, imager.radar.prf, centroid[m], sigma[m]
-                    )
-                ]
-                processing, focus = imager.focus(processings, velocity)
-                own = imager.step * round(velocity / imager.step)
-                chosen = focus.velocity if focus.accepted else own
-                image = imager.image(processing, chosen)
-                rows, columns, center = self._place(image, *beam)
+                found = self._focused(m, imager, float(centroid[m]), float(sigma[m]))
+                rows, columns, center = self._place(found.image, *self._beam(m))
+            except NoImageError as error:
+                self.reason[m] = REASONS.index(error.reason)
+                continue
             except ValueError as error:
                 self._refuse(m, error)
                 continue
-            if (processing, chosen) not in known:
-                known[processing, chosen] = len(chips)
-                chips.append(detected(image.data[rows, columns], self._looks))
+            key = found.processing, found.image.velocity
+            if key not in known:
+                known[key] = len(chips)
+                chips.append(detected(found.image.data[rows, columns], self._looks))
             if self.show_unfocused and not formed.any():
-                blurred = imager.image(processing, own)
-                rows, columns, _ = self._place(blurred, *beam)
+                blurred = imager.image(found.processing, found.own)
+                rows, columns, _ = self._place(blurred, *self._beam(m))
                 self.unfocused = detected(blurred.data[rows, columns], self._looks)
             formed[m] = True
-            values["index"][m] = known[processing, chosen]
+            self.reason[m] = REASONS.index(found.focus.reason)
+            values["index"][m] = known[key]
             values["row"][m], values["column"][m] = center
-            values["focused"][m] = focus.accepted
-            values["velocity"][m] = chosen
-            values["velocity_sigma"][m] = np.hypot(
-                self.velocity_sigma[m], focus.sigma if focus.accepted else 0.0
-            )
+            values["focused"][m] = found.focus.accepted
+            values["velocity"][m], values["velocity_sigma"][m] = found.velocity, found.sigma
         if not formed.any():
             return
         noise = self.normals("slant_range", 1)[:, 0]
-        values["slant_range"] = beam_range + self.range_sigma * noise
+        values["slant_range"] = self.acquired.beam_range + self.range_sigma * noise
         speed = np.linalg.norm(self.prior.v_e, axis=1)
-        values["sine"] = wavelength * beam_doppler / (2 * speed)
-        values["row_time"] = np.full(self.n_members, self.azimuth_looks / imager.radar.prf)
-        values["column_range"] = np.full(
-            self.n_members, self.range_looks * imager.radar.range_spacing
-        )
+        values["sine"] = wavelength * self.acquired.beam_doppler / (2 * speed)
+        values["row_time"][:] = self.azimuth_looks / imager.radar.prf
+        values["column_range"][:] = self.range_looks * imager.radar.range_spacing
         values["time_sigma"] = self.acquired.time_sigma
         values["side"] = self.acquired.side
         self.images = np.stack(chips)
         self.image.publish(t, valid=formed, **values)
 
+    def _focused(self, m: int, imager: Imager, centroid: float, sigma: float) -> _Formed:
+        """Image of a member, and the velocity that focuses the beam's center.
+
+        Raises
+        ------
+        NoImageError
+            If the estimate leads to none.
+        ValueError
+            If the echo is too small.
+        """
+        field, velocity_sigma = self._expected_velocity(m, imager.radar.wavelength)
+        reach = _SIGMAS * velocity_sigma / imager.migration_step
+        centroids = self._centroids(imager, centroid, sigma)
+        processing, focus = imager.focus(
+            [imager.processing(f, field.velocity, field.by_range) for f in centroids],
+            field.velocity,
+            reach=min(np.ceil(reach) * imager.migration_step, _FARTHEST),
+            velocity_rate=field.by_time,
+        )
+        if not focus.accepted:
+            image = imager.image(processing, field.velocity)
+            own = field.velocity, velocity_sigma
+            return _Formed(image, processing, focus, *own, field.velocity)
+        image = imager.image(processing, focus.velocity)
+        velocity = imager.velocity_at(
+            processing, focus.velocity, field.by_time, image.pixel(0.0, *self._beam(m))
+        )
+        relief = abs(field.by_height) * float(self.height_sigma[m])
+        return _Formed(
+            image, processing, focus, velocity, float(np.hypot(focus.sigma, relief)), field.velocity
+        )
+
+    def _centroids(self, imager: Imager, expected: float, sigma: float) -> list[float]:
+        if 7 * sigma > _MOST_CENTROIDS * imager.radar.prf:
+            raise NoImageError(OPEN, f"the centroid is known to {sigma:.0f} Hz only")
+        return centroid_candidates(imager.fraction, imager.radar.prf, expected, sigma)
+
+    def _beam(self, m: int) -> tuple[float, float]:
+        """Slant range and Doppler frequency of the beam's center."""
+        return float(self.acquired.beam_range[m]), float(self.acquired.beam_doppler[m])
+
     def _refuse(self, m: int, error: ValueError) -> None:
-        """Fail a member whose estimate leads to no image; the others have theirs."""
+        """Fail a member for which echo of this size holds no image of the size that is wanted."""
         lines, cells = self.echo.shape
         self.fail(
             np.arange(self.n_members) == m,
@@ -202,14 +273,18 @@ class ImageFormer(Component):
         column = multilook_index(center[1] - columns.start, self.range_looks)
         return rows, columns, (float(row), float(column))
 
-    def _expected_velocity(self, m: int, wavelength: float) -> tuple[float, float]:
-        """Effective velocity that a member's estimate implies, and its growth with range."""
+    def _expected_velocity(self, m: int, wavelength: float) -> tuple[VelocityField, float]:
+        """Effective velocity that a member's estimate implies, and its standard deviation."""
         r, v = self.prior.r_e[m], self.prior.v_e[m]
-        sine = wavelength * self.acquired.beam_doppler[m] / (2 * np.linalg.norm(v))
-        ranges = self.acquired.beam_range[m] + np.array([0.0, -_HALF_SWATH, _HALF_SWATH])
-        p = ground_point(r, v, ranges, sine, side=self._side(m))
-        own, near, far = (float(x) for x in effective_velocity_array(r, v, p))
-        return own, (far - near) / (2 * _HALF_SWATH)
+        speed = np.linalg.norm(v)
+        beam_range, beam_doppler = self._beam(m)
+        sine = wavelength * beam_doppler / (2 * speed)
+        try:
+            field = velocity_field(r, v, beam_range, sine, self._side(m))
+        except ValueError as error:
+            raise NoImageError(BLIND, str(error)) from error
+        variance = v @ self.prior.P[m, 3:6, 3:6] @ v / field.velocity**2
+        return field, float(np.sqrt(variance))
 
     def _require_side(self, fresh: Mask) -> None:
         """Raise where all who look at an echo look to the other side than it came from."""

@@ -44,7 +44,7 @@ from terrafix.models.radar.footprint import Footprint
 from terrafix.models.radar.imaging import Imager
 from terrafix.models.radar.scene import CoverMap, Scene
 from terrafix.models.sensors.aperture import LOOKS, side_of
-from terrafix.models.sensors.effective_velocity import effective_velocity_array
+from terrafix.models.sensors.effective_velocity import effective_velocity_array, velocity_field
 
 _TRACK_STEP = 0.02
 """Between places of an earlier flight [s]."""
@@ -362,8 +362,13 @@ class RecordedReference(_Reference):
                 imager.fraction, radar.prf, beam.doppler(radar.wavelength)
             )
             velocity = float(effective_velocity_array(r, v, beam.point))
-            processing = imager.processing(centroid, velocity, 0.0)
-            _, focus = imager.focus([processing], velocity)
+            sine = radar.wavelength * centroid / (2 * np.linalg.norm(v))
+            field = velocity_field(r, v, beam.slant_range, float(sine))
+            processing, focus = imager.focus(
+                [imager.processing(centroid, velocity, field.by_range)],
+                velocity,
+                velocity_rate=field.by_time,
+            )
             image = imager.image(processing, focus.velocity if focus.accepted else velocity)
             reach = abs(first_time) + 3 * duration
             arc = OrbitArc(r, v, 0.0, reach, reach)

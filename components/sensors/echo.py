@@ -109,7 +109,14 @@ class _Echo(SendsChirps):
                 f"'{self.name}' cannot tell where its boresight meets the ground: {error}"
             ) from error
 
-    def _publish(self, t: float, echo: ComplexArray, first_time: float, near: float) -> None:
+    def _publish(
+        self,
+        t: float,
+        echo: ComplexArray,
+        first_time: float,
+        near: float,
+        time_sigma: float = 0.0,
+    ) -> None:
         beam = self._boresight()
         radar = self._radar()
         reach = near + (echo.shape[1] - 1) * radar.range_spacing
@@ -127,7 +134,7 @@ class _Echo(SendsChirps):
             near_range=near,
             beam_range=beam.slant_range,
             beam_doppler=beam.doppler(radar.wavelength),
-            time_sigma=0.0,
+            time_sigma=time_sigma,
             side=beam.side,
         )
 
