@@ -41,6 +41,7 @@ from terrafix.models.radar.recordings.recording import (
     Recording,
     Sent,
     Track,
+    looked_through,
     lost_lines,
     seconds,
 )
@@ -158,7 +159,14 @@ def _recording(path: Path, file: Any, channel: str) -> Recording:
         *(path, samples, shape, _table(rx, file[samples]), _valid(tx, n), _gain(rx, n))
     )
     return Recording(
-        *(path, lines, place, lost_lines(lines, place, _SLIPPED), line_time, first_line),
+        *(
+            path,
+            lines,
+            place,
+            lost_lines(looked_through(lines), place, _SLIPPED),
+            line_time,
+            first_line,
+        ),
         near_range=float(ranges[0]),
         sent=sent,
         track=_track(file[root], epoch),

@@ -35,7 +35,7 @@ def make(path, kind):
         path.write_bytes(
             {
                 "level 1.1": ceos(b"COMPLEX*8"),
-                "level 1.0": ceos(b"COMPLEX INTEGER*2"),
+                "other bytes": ceos(b"COMPLEX INTEGER*2"),
                 "leader": CEOS.replace(b"\x32", b"\x0b").ljust(720),
                 "csv": b"time,i,q\n0.0,1,2\n",
                 "empty": b"",
@@ -54,7 +54,7 @@ def make(path, kind):
         ("mat", "it is a MATLAB file", "recorded_spotlight"),
         ("SAFE", "a zip archive of other files ('S1A.SAFE/manifest.safe')", "first_rg_line"),
         ("level 1.1", "CEOS, a file of lines\n  its samples are COMPLEX*8", "(level 1.1)"),
-        ("level 1.0", "CEOS, a file of lines\n  recorded echo is", "it is not read"),
+        ("other bytes", "CEOS, a file of lines\n  its samples are COMPLEX INTEGER*2", "'CI*1'"),
         ("leader", "CEOS, a leader", "name the file with the data"),
         ("csv", "it is text", "numpy.savez"),
         ("empty", "it is empty", "fetch it again"),
