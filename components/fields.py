@@ -65,6 +65,8 @@ ACQUISITION = {
     "near_range": Field((), "m", doc="slant range of the first cell"),
     "beam_range": Field((), "m", doc="slant range to where the beam's center meets the ground"),
     "beam_doppler": Field((), "Hz", doc="absolute Doppler frequency of the beam's center"),
+    "time_sigma": Field((), "s", doc="standard error of the times of its lines"),
+    "side": Field((), "1", doc="1: to the right of the track, -1: to the left"),
 }
 """When and where an echo was received; valid at the time its middle line was."""
 

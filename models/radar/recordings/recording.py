@@ -30,6 +30,9 @@ FORMATS = (
     "first_rg_cell, or NISAR L0B (HDF5)"
 )
 IMAGE = "an image, formed already: name the raw echo (level 0) that it was formed of"
+_MOVED = 0.07
+"""Lines that an image is moved by where 3 to 10 lines of its aperture are zeros, rms: measured by
+benchmarks/lost_lines.py."""
 _BLOCK = 2**22
 """Samples that are in memory at a time: 32 MB."""
 
@@ -185,6 +188,18 @@ class Recording:
             raise ValueError(f"'{self.path}' has no orbit, or no times of its lines")
         orbit = self.track.orbit
         return orbit.at(self.line_time + seconds(self.track.epoch - orbit.tags[0]))
+
+    def error_of_times(self, prf: float) -> float:
+        """Standard error of the times of what an image of it shows [s].
+
+        That of the times themselves, and what lines that are lost move an image by.
+
+        Parameters
+        ----------
+        prf : float
+            Pulse repetition frequency [Hz].
+        """
+        return float(np.hypot(self.time_sigma, (_MOVED / prf) if len(self.lost) else 0.0))
 
     def told(self) -> str:
         """What was lost, for messages; empty if nothing was."""
