@@ -33,10 +33,11 @@ from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import ComplexArray, FloatArray, Single
 from terrafix.models.core.ceos import HEADER, Kind, Record, read_records
+from terrafix.models.core.formats import CEOS_LEADER, kind_of
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.quaternion import from_matrix_array
 from terrafix.models.motion.ephemeris import Ephemeris
-from terrafix.models.motion.orbits.leader import POSITIONS, POSITIONS_NAME, orbit_of
+from terrafix.models.motion.orbits.leader import POSITIONS, POSITIONS_NAME, day_of, orbit_of
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT, gain_of
 from terrafix.models.radar.recordings.lines import places_by_number, places_by_tags
 from terrafix.models.radar.recordings.recording import (
@@ -66,6 +67,8 @@ _NAMES = {
     _ATTITUDE: "its attitude record",
     _CALIBRATION: "its calibration record",
 }
+_SHORTEST = {_SUMMARY: 1858, POSITIONS: 386, _ATTITUDE: 16, _CALIBRATION: 68}
+"""Bytes of records that are read."""
 _DESCRIPTOR_LENGTH = 720
 _PREFIX = 412
 _MOST_LINES, _MOST_CELLS = 999_999, 65_536
@@ -178,12 +181,27 @@ def read_ceos(path: Path) -> Recording:
         raise ValueError(f"'{path}' is not {WHAT}: {error}") from error
 
 
+def ceos_track(path: Path) -> Track:
+    """Track in the leader of a recording (CEOS, level 1.0), or in that of a file of lines.
+
+    Raises
+    ------
+    ValueError
+        If a field cannot be, or the leader is not beside the file.
+    OSError
+        If it cannot be read.
+    """
+    records = _records(path if kind_of(path)[0] == CEOS_LEADER else _leader(path))
+    epoch, orbit = day_of(records[POSITIONS]), orbit_of(records[POSITIONS])
+    return Track(epoch, orbit, _attitude(records, epoch, orbit))
+
+
 def _recording(path: Path) -> Recording:
     layout, n = _layout(path)
     prefix = np.array(_lines(path, layout, n)["prefix"])
     width = layout["samples"].itemsize // 2
     _check_prefixes(prefix, layout.itemsize, width)
-    records = _leader(path)
+    records = _records(_leader(path))
     summary = records[_SUMMARY]
     kept = _without_calibration(summary, n)
     prefix = prefix[kept]
@@ -333,7 +351,8 @@ def _gain(prefix: NDArray[np.void]) -> Single | None:
 # ------------------------------------------------------------------ the leader
 
 
-def _leader(path: Path) -> dict[Kind, Record]:
+def _leader(path: Path) -> Path:
+    """Leader of a file of lines."""
     name = path.name
     if name[:4].upper() != "IMG-" or name[6:7] != "-":
         raise ValueError(
@@ -343,17 +362,19 @@ def _leader(path: Path) -> dict[Kind, Record]:
     leader = path.with_name(("LED" if name[0] == "I" else "led") + name[6:])
     if not leader.is_file():
         raise ValueError(f"its leader '{leader.name}' is not beside it")
+    return leader
+
+
+def _records(leader: Path) -> dict[Kind, Record]:
     try:
         found = read_records(leader, _NAMES)
     except ValueError as error:
         raise ValueError(f"of its leader '{leader.name}', {error}") from error
-    missing = [name for kind, name in _NAMES.items() if kind not in found]
-    if missing:
-        raise ValueError(f"its leader '{leader.name}' lacks {missing[0].removeprefix('its ')}")
-    shortest = {_SUMMARY: 1858, POSITIONS: 386, _ATTITUDE: 16, _CALIBRATION: 68}
-    for kind, least in shortest.items():
-        if len(found[kind].content) < least:
-            raise ValueError(f"{_NAMES[kind]} has {len(found[kind].content)} bytes")
+    for kind, name in _NAMES.items():
+        if kind not in found:
+            raise ValueError(f"its leader '{leader.name}' lacks {name.removeprefix('its ')}")
+        if len(found[kind].content) < _SHORTEST[kind]:
+            raise ValueError(f"{name} has {len(found[kind].content)} bytes")
     return found
 
 

@@ -126,11 +126,31 @@ def read_l0b(path: Path, channel: str = "") -> Recording:
         raise ValueError(f"'{path}' is not {WHAT}: {reason}") from error
 
 
-def _recording(path: Path, file: Any, channel: str) -> Recording:
+def l0b_track(path: Path) -> Track:
+    """Track of a file (NISAR L0B, HDF5).
+
+    Raises
+    ------
+    ValueError
+        If it is of another kind, or a part cannot be.
+    """
+    with opened(path) as file:
+        root = _root(file)
+        times = f"{root}/lowRateTelemetry/orbit"
+        if not has_group(file, times):
+            raise ValueError("it has no orbit")
+        return _track(file[root], epoch_of(file[times]["time"]))
+
+
+def _root(file: Any) -> str:
     band = next((b for b in BANDS if has_group(file, f"science/{b}/RRSD/swaths")), None)
     if band is None:
         raise ValueError(_another(file))
-    root = f"science/{band}/RRSD"
+    return f"science/{band}/RRSD"
+
+
+def _recording(path: Path, file: Any, channel: str) -> Recording:
+    root = _root(file)
     name = _chosen(channels(file[f"{root}/swaths"]), channel)
     sent_group, samples = name.rpartition("/rx")[0], f"{root}/swaths/{name}"
     tx = file[f"{root}/swaths/{sent_group}"]
