@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from terrafix.models.core.formats import ARCHIVE, CEOS_DATA, CEOS_LEADER, HDF5, kind_of
+from terrafix.models.core.formats import ARCHIVE, CEOS_DATA, CEOS_LEADER, CPHD, HDF5, kind_of
 from terrafix.models.radar.recordings.arrays import read_npz
 from terrafix.models.radar.recordings.ceos import read_ceos
 from terrafix.models.radar.recordings.nisar import read_l0b
 from terrafix.models.radar.recordings.recording import FORMATS, IMAGE, WHAT, Recording
 
 _PICTURES = ("TIFF", "picture", "JPEG")
-_MATLAB = (
+_PHASE_HISTORY = (
     "phase history of an aircraft, which is compressed already, is for 'recorded_spotlight' "
     "(examples/aircraft_gotcha.toml)"
 )
@@ -53,8 +53,8 @@ def _advice(path: Path, found: str) -> list[str]:
     """What is known of echo, besides, of a kind of file."""
     if any(word in found for word in _PICTURES):
         return [f"if it is {IMAGE}"]
-    if "MATLAB" in found:
-        return [_MATLAB]
+    if "MATLAB" in found or found == CPHD:
+        return [_PHASE_HISTORY]
     if found == CEOS_LEADER:
         return ["its lines are in the file IMG-... beside it"]
     return []
