@@ -197,7 +197,8 @@ class RecordedOrbit(Component):
     """A satellite's real or earlier orbit, on the ports of `orbit`.
 
     From an orbit file of others (OEM, SP3-c, SP3-d, EOF, table, NISAR's HDF5, a leader of CEOS),
-    whose states are interpolated to the eighth order, or from a result of terrafix (.nc), played sample by sample.
+    whose states are interpolated to the eighth order, or from a result of terrafix (.nc), played
+    sample by sample.
     A run begins at the system's epoch, or where it has none `start` after the first state. What a
     file does not hold is supplied: `delta_v_e` is zero; inertial axes are GCRF in a system with an
     epoch, else the Earth-fixed ones of t = 0 turned by `earth_angle0`.

@@ -44,12 +44,12 @@ def read_recording(path: Path, channel: str = "") -> Recording:
     if found == CEOS_DATA:
         return read_ceos(path)
     if found and found != ARCHIVE:
-        told = "".join(f"\n  {line}" for line in (*_advice(path, found), FORMATS, cure))
+        told = "".join(f"\n  {line}" for line in (*_advice(found), FORMATS, cure))
         raise ValueError(f"'{path}' is not {WHAT}: it is {found}{told}")
     return read_npz(path)
 
 
-def _advice(path: Path, found: str) -> list[str]:
+def _advice(found: str) -> list[str]:
     """What is known of echo, besides, of a kind of file."""
     if any(word in found for word in _PICTURES):
         return [f"if it is {IMAGE}"]

@@ -95,7 +95,7 @@ def test_axes_of_the_antenna_are_told_by_where_they_lie(tmp_path, look):
     path = write(tmp_path / "a.h5", samples, **given)
     one, other = levels(flown(path, look), "q_be")
     np.testing.assert_allclose(np.abs(np.sum(one * other, axis=-1)), 1.0, atol=1e-12)
-    with pytest.raises(SystemCheckError, match="its boresight is 34.30 deg off nadir to the"):
+    with pytest.raises(SystemCheckError, match=r"its boresight is 34\.30 deg off nadir to the"):
         flown(path, -look)
 
 
@@ -108,7 +108,9 @@ def test_what_is_missing_is_asked_for(tmp_path):
     path = leader(tmp_path)
     alone = components.recorded_attitude(result_file=path)
     alone.name = "attitude"
-    with pytest.raises(ConfigurationError, match="is not told how it is mounted\n  set attitude.l"):
+    with pytest.raises(
+        ConfigurationError, match=r"is not told how it is mounted\n  set attitude\.l"
+    ):
         alone.validate()
     assert not alone.takes("source")
     assert alone.takes("start")

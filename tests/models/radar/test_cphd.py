@@ -141,5 +141,5 @@ def test_a_speed_is_refused_where_times_are_known(tmp_path):
     component.name = "flown"
     component.validate()
     component.speed = 90.0
-    with pytest.raises(ConfigurationError, match="'flown.speed' is 90 m/s, but its file has the"):
+    with pytest.raises(ConfigurationError, match=r"'flown\.speed' is 90 m/s, but its file has the"):
         component.validate()

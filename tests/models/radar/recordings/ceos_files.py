@@ -26,9 +26,11 @@ def record(number, kind, length, fields):
 
 
 def _descriptor_start(form):
-    return [(2, "A"), (2, ""), (12, "CEOS-SAR"), (2, "A"), (2, "A"), (12, "1.0"), (4, 1), (16, form)] + [
-        (4, "FSEQ"), (8, 1), (4, 4), (4, "FTYP"), (8, 5), (4, 4), (4, "FLGT"), (8, 9), (4, 4), (68, "")
-    ]  # fmt: skip
+    fields = [(2, "A"), (2, ""), (12, "CEOS-SAR"), (2, "A"), (2, "A"), (12, "1.0")]
+    fields += [(4, 1), (16, form)]
+    for flag, at in (("FSEQ", 1), ("FTYP", 5), ("FLGT", 9)):
+        fields += [(4, flag), (8, at), (4, 4)]
+    return [*fields, (68, "")]
 
 
 def descriptor(n, length, n_bytes, code="CI*1", samples="COMPLEX INTEGER*2"):
@@ -41,7 +43,15 @@ def descriptor(n, length, n_bytes, code="CI*1", samples="COMPLEX INTEGER*2"):
 
 def line(k, samples, length, *, number, millisecond, near=NEAR, year=2011, day=13, **change):
     """Record of line k, from 0, of bytes (2 * n_cells,)."""
-    said = dict(left=0, right=0, prf=round(1e3 * PRF), scan=0, compressed=0, gain=0, nought=0)
+    said = {
+        "left": 0,
+        "right": 0,
+        "prf": round(1e3 * PRF),
+        "scan": 0,
+        "compressed": 0,
+        "gain": 0,
+        "nought": 0,
+    }
     said |= change
     pixels = len(samples) // 2 - said["left"] - said["right"]
     prefix = struct.pack(">I4BI", k + 2, 50, 10, 18, 20, length)

@@ -26,7 +26,8 @@ def metadata(n, k, *, sign, domain, center, form="CF8", names=("one",), amplitud
     each = {"CF8": 8, "CI4": 4, "CI2": 2}[form]
     channels = "".join(
         f"<Channel><Identifier>{name}</Identifier><NumVectors>{n}</NumVectors>"
-        f"<NumSamples>{k}</NumSamples><SignalArrayByteOffset>{i * n * k * each}</SignalArrayByteOffset>"
+        f"<NumSamples>{k}</NumSamples>"
+        f"<SignalArrayByteOffset>{i * n * k * each}</SignalArrayByteOffset>"
         f"<PVPArrayByteOffset>{i * n * 8 * at}</PVPArrayByteOffset></Channel>"
         for i, name in enumerate(names)
     )

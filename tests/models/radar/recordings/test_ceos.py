@@ -242,16 +242,16 @@ def test_lines_that_cannot_be_are_named(tmp_path, samples, change, told):
     ("records", "told"),
     [
         ({"summary": ceos.summary(wavelength=0.0)}, r"a wavelength of 0 m \(bytes 501 to 516\)"),
-        ({"summary": ceos.summary(sample_rate="abc")}, r"'abc' for the sampling rate .* not a number"),
+        ({"summary": ceos.summary(sample_rate="abc")}, "'abc' for the sampling rate"),
         ({"summary": ceos.summary(channels=9)}, "says 9 for the number of channels"),
         ({"summary": ceos.summary(clock=0.0)}, "a clock angle of 0 deg"),
         ({"summary": ceos.summary(calibration=(3, 1, 399, 0, 0))}, "leaves lines 400 to 400"),
         ({"summary": b""}, "lacks data set summary"),
         ({"attitudes": b""}, "lacks attitude record"),
         ({"calibration": ceos.calibration(0.0)}, "sweeps 0 Hz"),
-        ({"positions": ceos.positions(np.arange(28) * 60.0, np.zeros((28, 3)), np.ones((28, 3)))}, "inside the Earth"),
-        ({"start": b"\0\0\0\1\x0b\xc0\x12\x12\xff\xff\xff\xff"}, "record 1 says that it is 4294967295"),
-        ({"calibration": ceos.calibration()[:-1]}, "its record 5 says that it is 13212 bytes long, and 13211"),
+        ({"positions": ceos.positions([0, 60], np.ones((2, 3)), np.ones((2, 3)))}, "inside the E"),
+        ({"start": b"\0\0\0\1\x0b\xc0\x12\x12\xff\xff\xff\xff"}, "that it is 4294967295"),
+        ({"calibration": ceos.calibration()[:-1]}, "is 13212 bytes long, and 13211"),
     ],
 )  # fmt: skip
 def test_leaders_that_cannot_be_are_named(tmp_path, samples, records, told):
@@ -262,7 +262,7 @@ def test_leaders_that_cannot_be_are_named(tmp_path, samples, records, told):
 
 def test_a_leader_that_is_elsewhere_is_asked_for(tmp_path, samples):
     path = write(tmp_path, samples)
-    with pytest.raises(ValueError, match="its leader 'LED-ALPSRP000000000-H1.0__A' is not beside"):
+    with pytest.raises(ValueError, match=r"its leader 'LED-\w+-H1\.0__A' is not beside"):
         read_recording(path)
     with pytest.raises(ValueError, match=r"not named IMG-HH-\.\.\."):
         read_recording(path.rename(tmp_path / "echo.raw"))
@@ -291,11 +291,11 @@ def test_descriptors_that_cannot_be_are_named(tmp_path, samples, made, told):
 
 @pytest.mark.parametrize("which", ["IMG", "LED"])
 def test_damaged_files_are_refused_or_read(tmp_path, samples, which):
-    """Truncated and with bytes changed at random: a ValueError that names the file, or a recording."""
+    """Truncated, and with bytes changed at random: a ValueError that names the file, or read."""
     rng = np.random.default_rng(5)
     led, img = leader(tmp_path), write(tmp_path, samples[:60])
     target = img if which == "IMG" else led
-    whole, refused = target.read_bytes(), 0
+    whole, told = target.read_bytes(), []
     for k in range(40):
         damaged = bytearray(whole)
         if k % 2:
@@ -308,6 +308,6 @@ def test_damaged_files_are_refused_or_read(tmp_path, samples, which):
         try:
             read_recording(img)
         except ValueError as error:
-            refused += 1
-            assert str(error).startswith(f"'{img}' is not recorded echo: ")
-    assert refused >= 20
+            told.append(str(error))
+    assert len(told) >= 20
+    assert all(text.startswith(f"'{img}' is not recorded echo: ") for text in told)
