@@ -51,6 +51,8 @@ _SLIPPED = "its 'UTCtime' does not say so: have the times corrected by whoever m
 _TOLD = 6
 """Names of what a file of another kind holds that are told."""
 _N_CODES = 65536
+_MOST_COMPRESSED = 300
+"""Samples of echo in a byte at most: zlib makes a thousandth of zeros, which are four bytes each."""
 _EVEN = 1e-4
 """How far ranges may be from even spacing, in cells."""
 _UNIT = 1e-3
@@ -155,6 +157,8 @@ def _recording(path: Path, file: Any, channel: str) -> Recording:
     sent_group, samples = name.rpartition("/rx")[0], f"{root}/swaths/{name}"
     tx = file[f"{root}/swaths/{sent_group}"]
     n, n_cells = shape = _shape(file[samples])
+    if n * n_cells > _MOST_COMPRESSED * path.stat().st_size:
+        raise ValueError(f"it says {n} lines of {n_cells} cells, and has {path.stat().st_size} bytes")
     times = values_of(tx, "UTCtime", (n,))
     epoch = epoch_of(tx["UTCtime"])
     place = places_by_time(times, "UTCtime")

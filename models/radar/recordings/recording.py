@@ -164,11 +164,10 @@ class Recording:
         """Echo of lines `first` to `last - 1`, counted from 0, (n, n_cells); lost ones are zero."""
         last = self.n_lines if last is None else last
         k, m = (int(i) for i in np.searchsorted(self.place, (first, last)))
-        there = self.lines.read(k, m)
-        if len(there) == last - first:
-            return there
         echo = np.zeros((last - first, self.n_cells), np.complex64)
-        echo[self.place[k:m] - first] = there
+        for begin, end in _spans(m - k, self.n_cells):
+            own = slice(k + begin, k + end)
+            echo[self.place[own] - first] = self.lines.read(own.start, own.stop)
         return echo
 
     def blocks(self) -> Iterator[tuple[int, ComplexArray]]:
