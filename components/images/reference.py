@@ -298,6 +298,7 @@ class RecordedReference(_Reference):
 
     folder = RecordedEcho.folder
     files = RecordedEcho.files
+    channel = RecordedEcho.channel
     range0 = RecordedEcho.range0
     start_line = RecordedEcho.start_line
     band = Parameter(

@@ -208,7 +208,10 @@ class RecordedEcho(_Echo):
 
     Lines of the recording are numbered; `start_line` is the one received at t = 0. The radar's
     parameters are those of the recording, and `range0` its slant range of cell 1: set where the
-    files do not say them (.npz), and left out, or the same, where they do (NISAR L0B).
+    files do not say them (.npz), and left out, or the same, where they do (NISAR L0B, CEOS).
+
+    The standard error of the times of lines is what the format leaves open, and, where lines were
+    lost, what zeros in their place do to an image.
     """
 
     carrier = Parameter(
@@ -227,7 +230,8 @@ class RecordedEcho(_Echo):
         np.inf, unit="s", positive=True, infinite=True, doc="of the pulse; inf: the files'"
     )
     folder = FilePath(doc="where the files are")
-    files = Text(doc="names of the files (.npz, .h5), one for each step, separated by blanks")
+    files = Text(doc="names of the files (.npz, .h5, CEOS), one for each step, parted by blanks")
+    channel = Text("", doc='which, where files have several: "A/HH"')
     range0 = Parameter(
         np.inf,
         unit="m",
@@ -278,4 +282,7 @@ class RecordedEcho(_Echo):
         path = file_of_step(self)
         lines = read_lines(self, path, report=True)
         self._check_time(lines, path, t)
-        self._publish(t, lines.read(), self._first_time(lines), self._near_range(lines))
+        self._publish(
+            *(t, lines.read(), self._first_time(lines), self._near_range(lines)),
+            time_sigma=lines.error_of_times(self._sends("prf")),
+        )

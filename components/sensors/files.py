@@ -25,7 +25,7 @@ _ALIKE = 1e-6
 def read_lines(component: Component, path: Path, *, report: bool = False) -> Recording:
     """Recording in a file of a component; `report` says if lines were lost."""
     try:
-        lines = read_recording(path)
+        lines = read_recording(path, _channel(component))
     except (OSError, ValueError) as error:
         raise ConfigurationError(
             f"'{component.name}' cannot read its echo: {error}\n"
@@ -61,15 +61,20 @@ def _told(component: Component, path: Path) -> Sent | None:
         return read_lines(component, path).sent
     stat = path.stat()
     try:
-        return _sent(path, stat.st_mtime_ns, stat.st_size)
+        return _sent(path, _channel(component), stat.st_mtime_ns, stat.st_size)
     except (OSError, ValueError):
         return read_lines(component, path).sent
 
 
 @lru_cache(maxsize=64)
-def _sent(path: Path, _changed: int, _size: int) -> Sent | None:
+def _sent(path: Path, channel: str, _changed: int, _size: int) -> Sent | None:
     """What a file says of its radar, as long as it stays as it is: files are large."""
-    return read_recording(path).sent
+    return read_recording(path, channel).sent
+
+
+def _channel(component: Component) -> str:
+    channel: str = component.setting("channel")
+    return channel
 
 
 def _alike(one: Sent, other: Sent) -> bool:

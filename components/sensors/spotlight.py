@@ -10,20 +10,23 @@ from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import FilePath, Parameter, Text
 from terrafix.cosim.declare.ports import MessageOutput, SharedOutput
-from terrafix.models.radar.phase_history import PhaseHistory, read_gotcha
+from terrafix.models.radar.phase_files import read_phase_history
+from terrafix.models.radar.phase_history import PhaseHistory
 
 
 class RecordedSpotlight(Component):
     """Plays the phase history of some degrees of aspect, told once at t = 0.
 
-    Files are those of the AFRL "Gotcha" set. They hold no times: the speed is assumed.
+    Files are those of the AFRL "Gotcha" set, which hold no times: the speed is assumed; or one of
+    CPHD (FX domain), which has them.
     """
 
     default_rate = Rate(times=["0"])
 
     folder = FilePath(doc="where the files are")
-    files = Text(doc="names of the files (.mat), separated by blanks, in order of flight")
-    speed = Parameter(100.0, unit="m/s", positive=True, doc="assumed: it was not recorded")
+    files = Text(doc="names of the files (.mat) in order of flight, parted by blanks, or one .cphd")
+    channel = Text("", doc="which, where the file has several (.cphd)")
+    speed = Parameter(100.0, unit="m/s", positive=True, doc="assumed: it was not recorded (.mat)")
 
     phase = SharedOutput(**PHASE, doc="pulses, frequencies")
     frequency = SharedOutput((None,), unit="Hz", doc="of its columns")
@@ -33,12 +36,16 @@ class RecordedSpotlight(Component):
 
     def validate(self) -> None:
         """Read the files."""
-        self._read()
+        if self._read().t is not None and not self.is_default("speed"):
+            raise ConfigurationError(
+                f"'{self.name}.speed' is {self.setting('speed'):g} m/s, but its file has the times "
+                "of its pulses\n  leave it out"
+            )
 
     def _read(self) -> PhaseHistory:
         try:
-            return read_gotcha(recorded_files(self))
-        except (OSError, ValueError) as error:
+            return read_phase_history(recorded_files(self), self.setting("channel"))
+        except (OSError, ValueError, ImportError) as error:
             raise ConfigurationError(
                 f"'{self.name}' cannot read its phase history: {error}\n"
                 f"  set {self.name}.folder and {self.name}.files, or TERRAFIX_DATA to the folder "

@@ -1,7 +1,7 @@
 """Playback: a recorded orbit, attitude or IMU in the place of a simulated one, on the same ports.
 
 A result of terrafix is played sample by sample, at the times it was recorded at and to the same
-bytes; an orbit file is interpolated.
+bytes; an orbit file is interpolated, and so is the attitude in a file of radar echo.
 """
 
 from __future__ import annotations
@@ -27,12 +27,19 @@ from terrafix.models.core.timescales import Instant, parse_epoch
 from terrafix.models.geometry.celestial import Turning
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.frames import inertial_from_earth_fixed_array
+from terrafix.models.geometry.quaternion import (
+    inverse_array,
+    product_array,
+    rotation_vector_array,
+)
 from terrafix.models.motion.ephemeris import Ephemeris
 from terrafix.models.motion.orbits.files import read_orbit
+from terrafix.models.radar.recordings.attitude import BodyAttitude, read_body_attitude
 
 CLOSE = 1e-9  # [s] within which two times are the same: far below any step, far above rounding
 
 
+_EARTH_RATE = EARTH.rotation_rate
 _UNCOVERED = "the orbit file does not cover this time"
 
 
@@ -189,8 +196,9 @@ def last_step(rate: Rate | None, duration: float) -> float:
 class RecordedOrbit(Component):
     """A satellite's real or earlier orbit, on the ports of `orbit`.
 
-    From an orbit file of others (OEM, SP3-c, SP3-d, EOF, table, NISAR's HDF5), whose states are
-    interpolated to the eighth order, or from a result of terrafix (.nc), played sample by sample.
+    From an orbit file of others (OEM, SP3-c, SP3-d, EOF, table, NISAR's HDF5, a leader of CEOS),
+    whose states are interpolated to the eighth order, or from a result of terrafix (.nc), played
+    sample by sample.
     A run begins at the system's epoch, or where it has none `start` after the first state. What a
     file does not hold is supplied: `delta_v_e` is zero; inertial axes are GCRF in a system with an
     epoch, else the Earth-fixed ones of t = 0 turned by `earth_angle0`.
@@ -198,7 +206,7 @@ class RecordedOrbit(Component):
 
     default_rate = Rate(hz=100)
 
-    orbit_file = FilePath(doc="orbit file (OEM, SP3, .EOF, .csv, .h5) or result (.nc)")
+    orbit_file = FilePath(doc="orbit file (OEM, SP3, .EOF, .csv, .h5, LED-) or result (.nc)")
     source = Text("orbit", doc="path of the component whose outputs are played (.nc)")
     satellite = Text("", doc="which, in a file of several (OEM, SP3)")
     start = Parameter(
@@ -444,11 +452,137 @@ class Playback(Component):
 
 
 class RecordedAttitude(Playback):
-    """A recorded attitude, on the ports of `lvlh_attitude`."""
+    """A recorded attitude, on the ports of `lvlh_attitude`.
+
+    From a result of terrafix (.nc), played sample by sample, or from a file of radar echo that
+    holds the attitude of its antenna (NISAR's HDF5, CEOS's leader), between whose times the body
+    turns evenly. A run begins at the system's epoch, or where it has none `start` after the first
+    state of the orbit in that file, as that of `recorded_orbit` does. Body axes are those in which
+    the antenna looks `look` off nadir, across the track.
+    """
 
     default_rate = Rate(hz=100)
     recorded = ("q_be", "delta_v_b", "delta_theta_b")
 
+    result_file = FilePath(doc="result of an earlier run (.nc), or file of radar echo (.h5, CEOS)")
+    source = Text("attitude", doc="path of the component whose outputs are played (.nc)")
+    start = Parameter(
+        0.0, unit="s", minimum=0.0, doc="t = 0, after the first state (echo, without an epoch)"
+    )
+    look = Parameter(
+        np.inf,
+        unit="rad",
+        infinite=True,
+        doc="off-nadir angle that the antenna is mounted at, positive to the right (echo)",
+    )
+
     q_be = LvlhAttitude.q_be
     delta_v_b = LvlhAttitude.delta_v_b
     delta_theta_b = LvlhAttitude.delta_theta_b
+
+    _epoch: str | None = None
+    _body: BodyAttitude | None = None
+
+    @property
+    def _played(self) -> bool:
+        path: Path = self.setting("result_file")
+        return path.suffix == ".nc"
+
+    def takes(self, name: str) -> bool:
+        """Whether a setting has any effect on a file of this kind."""
+        path: Path | None = self.given_parameters.get("result_file")
+        if path is not None and name in ("source", "start", "look"):
+            return (path.suffix == ".nc") == (name == "source")
+        return super().takes(name)
+
+    def validate(self) -> None:
+        """Read the file and find what is needed in it."""
+        if self._played:
+            super().validate()
+        else:
+            self._read_body()
+
+    def validate_epoch(self, epoch: str | None) -> None:
+        """Take the epoch of the system."""
+        self._epoch = epoch
+
+    def validate_duration(self, duration: float) -> None:
+        """Read the file and look whether it covers the run."""
+        if self._played:
+            super().validate_duration(duration)
+            return
+        body = self._read_body()
+        first = self._first(body, self._epoch)
+        for t in (0.0, last_step(self.rate, duration)):
+            self._attitude(body, first + t)
+
+    def bind(self, environment: Environment) -> None:
+        """Read the file."""
+        if self._played:
+            super().bind(environment)
+            return
+        Component.bind(self, environment)
+        self._body = self._read_body()
+
+    def _read_body(self) -> BodyAttitude:
+        path: Path = self.setting("result_file")
+        look = float(self.setting("look"))
+        if np.isinf(look):
+            raise ConfigurationError(
+                f"'{self.name}' reads the attitude of an antenna from '{path.name}', and is not "
+                f"told how it is mounted\n  set {self.name}.look, as that of the radar"
+            )
+        try:
+            return read_body_attitude(path, look)
+        except (OSError, ValueError, ImportError) as error:
+            raise ConfigurationError(
+                f"'{self.name}' cannot read its attitude: {error}\n"
+                f"  set {self.name}.result_file and {self.name}.look, or TERRAFIX_DATA to the "
+                "folder with the data"
+            ) from error
+
+    def _first(self, body: BodyAttitude, epoch: str | None) -> float:
+        """Time of t = 0 since the first state of the orbit [s]."""
+        start = float(self.setting("start"))
+        if epoch is None:
+            return start
+        if start:
+            raise ConfigurationError(
+                f"'{self.name}.start' is {start:g} s, but the run begins at the system's epoch, "
+                f"{epoch}\n  leave one of them"
+            )
+        try:
+            return body.orbit.since_first(read_epoch(self, epoch))
+        except (ValueError, ImportError) as error:
+            raise ConfigurationError(f"'{self.name}' cannot be at {epoch}: {error}") from error
+
+    def _attitude(self, body: BodyAttitude, t: float) -> FloatArray:
+        try:
+            return body.at(t)
+        except ValueError as error:
+            path: Path = self.setting("result_file")
+            raise ConfigurationError(
+                f"'{self.name}' cannot play '{path.name}': {error}\n"
+                f"  fly within that (--duration), or set {self.name}.start"
+            ) from error
+
+    def _initialize_impl(self) -> None:
+        if self._body is None:
+            super()._initialize_impl()
+            return
+        self._begin = self._first(self._body, self.environment.epoch)
+        self._last_q = self._attitude(self._body, self._begin)
+        self.q_be = self._last_q
+        self.delta_v_b = self.delta_theta_b = 0.0
+
+    def _step_impl(self, t: float, dt: float) -> None:
+        if self._body is None:
+            super()._step_impl(t, dt)
+            return
+        q = self._attitude(self._body, self._begin + t)
+        q *= 1.0 if q @ self._last_q >= 0 else -1.0
+        turn = np.array([0.0, 0.0, np.sin(_EARTH_RATE * dt / 2), np.cos(_EARTH_RATE * dt / 2)])
+        moved = product_array(product_array(q, turn), inverse_array(self._last_q))
+        self.q_be, self.delta_theta_b = q, rotation_vector_array(moved)
+        self.delta_v_b = 0.0
+        self._last_q = q

@@ -5,6 +5,7 @@ Files are read with errors that say what is wrong with the file.
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -74,6 +75,7 @@ def read_arrays(
 
 
 def _array(archive: Any, key: str) -> NDArray[Any]:
+    _check_size(archive, key)
     try:
         array = np.asarray(archive[key])
     except ValueError as error:
@@ -86,3 +88,18 @@ def _array(archive: Any, key: str) -> NDArray[Any]:
     if array.dtype.kind not in "biufc":
         raise ValueError(f"its '{key}' holds {array.dtype}, not numbers")
     return array
+
+
+def _check_size(archive: Any, key: str) -> None:
+    """Look whether an array has the bytes that its shape wants, before there is room made for it."""
+    info = archive.zip.getinfo(f"{key}.npy")
+    with archive.zip.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        read = {(1, 0): np.lib.format.read_array_header_1_0}
+        shape, _, dtype = read.get(version, np.lib.format.read_array_header_2_0)(member)
+        wanted = math.prod(shape) * dtype.itemsize + member.tell()
+    if not dtype.hasobject and wanted > info.file_size:
+        raise ValueError(
+            f"its '{key}' is damaged: it says shape {shape} of {dtype}, which is {wanted} bytes, and "
+            f"has {info.file_size}"
+        )

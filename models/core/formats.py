@@ -8,16 +8,19 @@ ARCHIVE = "a zip archive"
 """What a file of named arrays (.npz) is, too."""
 HDF5 = "HDF5 or NetCDF-4"
 CEOS_DATA = "CEOS, a file of lines"
+CPHD = "CPHD, phase history"
+CEOS_LEADER = "CEOS, a leader"
 _NUMPY = "write its arrays with numpy.savez"
 _KINDS = (
     (b"II*\0", "a TIFF (GeoTIFF)", f"read it with GDAL or rasterio, and {_NUMPY}"),
     (b"MM\0*", "a TIFF (GeoTIFF)", f"read it with GDAL or rasterio, and {_NUMPY}"),
     (b"II+\0", "a big TIFF (GeoTIFF)", f"read it with GDAL or rasterio, and {_NUMPY}"),
     (b"\x89HDF\r\n\x1a\n", HDF5, f"read it with h5py or xarray, and {_NUMPY}"),
-    (b"\0\0\0\1\x32\xc0\x12\x12", CEOS_DATA, "it is not read: write its echo with numpy.savez"),
-    (b"\0\0\0\1\x0b\xc0\x12\x12", "CEOS, a leader", "name the file with the data"),
+    (b"\0\0\0\1\x32\xc0\x12\x12", CEOS_DATA, f"read it with GDAL, and {_NUMPY}"),
+    (b"\0\0\0\1\x0b\xc0\x12\x12", CEOS_LEADER, "name the file with the data"),
     (b"\0\0\0\1\x3f\xc0\x12\x12", "CEOS, a trailer", "name the file with the data"),
     (b"\0\0\0\1\xc0\xc0\x12\x12", "CEOS, a volume directory", "name the file with the data"),
+    (b"CPHD/", CPHD, "name it in 'recorded_spotlight'"),
     (b"CDF", "NetCDF", f"read it with xarray, and {_NUMPY}"),
     (b"MATLAB 7.3", "a MATLAB file, 7.3", f"read it with h5py, and {_NUMPY}"),
     (b"MATLAB", "a MATLAB file", f"read it with scipy.io.loadmat, and {_NUMPY}"),

@@ -6,6 +6,7 @@ seconds are read, and a fraction is refused.
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ import numpy as np
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.formats import HDF5
 
+_MOST = 50_000_000
+"""Numbers of a data set that is read whole."""
 _EPOCH = re.compile(r"seconds since (\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(\.\d*[1-9])?")
 
 
@@ -55,6 +58,9 @@ def values_of(group: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
     """
     if name not in group.variables:
         raise ValueError(f"its '{group.path}' has no '{name}'")
+    size = math.prod(group[name].shape)
+    if size > _MOST:
+        raise ValueError(f"'{name}' says that it has {size} numbers, more than are read")
     values = np.asarray(group[name][...], np.float64)
     if len(values.shape) != len(shape) or any(
         m not in (-1, k) for k, m in zip(values.shape, shape, strict=True)

@@ -26,6 +26,8 @@ from scipy.signal import get_window
 from terrafix.models.core.arrays import ComplexArray, Single
 
 SPEED_OF_LIGHT = 299792458.0
+_MOST_ATTENUATION = 100.0
+"""By which lines of one echo may differ [dB]."""
 """Speed of light in vacuum [m/s]."""
 
 Window = str | tuple[Any, ...]
@@ -195,11 +197,13 @@ def gain_of(attenuation_db: ArrayLike, n_lines: int) -> Single:
     Raises
     ------
     ValueError
-        If there is not one finite attenuation per line.
+        If there is not one finite attenuation per line, or they differ by more than 100 dB.
     """
     db = np.asarray(attenuation_db, dtype=np.float64)
     if db.shape != (n_lines,) or not np.isfinite(db).all():
         raise ValueError(
             f"an echo of {n_lines} lines wants as many finite attenuations, got {db.shape}"
         )
+    if np.ptp(db) > _MOST_ATTENUATION:
+        raise ValueError(f"its attenuation varies by {np.ptp(db):.6g} dB, which none does")
     return np.asarray(10 ** ((db - db.min()) / 20), np.float32)

@@ -53,17 +53,21 @@ class PhaseHistory:
         ground at z = 0 [m].
     reference : ndarray, shape (n_pulses,)
         Range to which each pulse was compensated [m].
+    t : ndarray, shape (n_pulses,), optional
+        Times of the pulses [s], where they were recorded.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, something is not finite, or frequencies are not in equal steps.
+        If shapes do not fit, something is not finite, frequencies are not in equal steps, or times
+        do not increase.
     """
 
     phase: ComplexArray
     frequency: FloatArray
     r: FloatArray
     reference: FloatArray
+    t: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n, k = self.phase.shape if self.phase.ndim == 2 else (0, 0)
@@ -80,6 +84,8 @@ class PhaseHistory:
         steps = np.diff(self.frequency)
         if not (steps.mean() > 0 and np.abs(steps / steps.mean() - 1).max() < _EVEN * k):
             raise ValueError("frequencies of a phase history are not in equal steps upward")
+        if self.t is not None and not (self.t.shape == (n,) and (np.diff(self.t) > 0).all()):
+            raise ValueError("times of a phase history do not increase from pulse to pulse")
 
     @property
     def wavelength(self) -> float:
@@ -87,7 +93,12 @@ class PhaseHistory:
         return SPEED_OF_LIGHT / float(self.frequency[len(self.frequency) // 2])
 
     def times(self, speed: float) -> FloatArray:
-        """Times (n_pulses,) of the pulses from their mean [s], flown at a speed [m/s]."""
+        """Times (n_pulses,) of the pulses from their mean [s].
+
+        Those recorded, or else as flown at a speed [m/s].
+        """
+        if self.t is not None:
+            return np.asarray(self.t - self.t.mean())
         way = np.linalg.norm(np.diff(self.r, axis=0), axis=1)
         t = np.concatenate([[0.0], np.cumsum(way)]) / speed
         return np.asarray(t - t.mean())

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from terrafix.models.core.formats import HDF5, kind_of
+from terrafix.models.core.formats import CEOS_LEADER, HDF5, kind_of
 from terrafix.models.motion.ephemeris import Ephemeris, read_eof
 from terrafix.models.motion.orbits.hdf5 import read_hdf5
+from terrafix.models.motion.orbits.leader import read_leader
 from terrafix.models.motion.orbits.oem import read_oem
 from terrafix.models.motion.orbits.sp3 import read_sp3
 from terrafix.models.motion.orbits.table import read_table
 
-FORMATS = "OEM, SP3-c, SP3-d, EOF, a table (.csv), or a NISAR product (HDF5)"
+FORMATS = "OEM, SP3-c, SP3-d, EOF, a table (.csv), a NISAR product (HDF5), or a leader of CEOS"
 OF_MANY = ("oem", "sp3")
 """Formats that may hold several satellites."""
 
 
 def format_of(path: Path) -> str:
-    """What format a file is in: "oem", "sp3", "eof", "hdf5" or "table".
+    """What format a file is in: "oem", "sp3", "eof", "hdf5", "leader" or "table".
 
     Raises
     ------
@@ -41,11 +42,13 @@ def format_of(path: Path) -> str:
     found, _ = kind_of(path)
     if found == HDF5:
         return "hdf5"
+    if found == CEOS_LEADER:
+        return "leader"
     raise ValueError(f"it is {found or 'of a kind that is not known'}; read are {FORMATS}")
 
 
 def read_orbit(path: str | Path, satellite: str = "") -> Ephemeris:
-    """Read an orbit file: OEM, SP3-c or SP3-d, EOF, a table (.csv), or a NISAR product (HDF5).
+    """Read an orbit file: OEM, SP3, EOF, a table (.csv), NISAR's HDF5, or a leader of CEOS.
 
     Parameters
     ----------
@@ -73,6 +76,8 @@ def read_orbit(path: str | Path, satellite: str = "") -> Ephemeris:
             return read_eof(path)
         if kind == "hdf5":
             return read_hdf5(path)
+        if kind == "leader":
+            return read_leader(path)
         if kind == "oem":
             return read_oem(path, satellite).ephemeris()
         return (read_sp3(path, satellite) if kind == "sp3" else read_table(path)).ephemeris()

@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 from terrafix.models.core.arrays import ComplexArray, FloatArray, Single, read_arrays
 from terrafix.models.radar.chirp import gain_of
 from terrafix.models.radar.recordings.lines import on_grid, places_by_number, places_by_time
-from terrafix.models.radar.recordings.recording import WHAT, Recording, lost_lines
+from terrafix.models.radar.recordings.recording import (
+    WHAT,
+    Recording,
+    looked_through,
+    lost_lines,
+)
 
 PLACE = ("first_rg_line", "first_rg_cell")
 _SLIPPED = "give it the number of every line (line_number), or its time (line_time_s)"
@@ -70,7 +75,7 @@ def read_npz(path: Path) -> Recording:
         first = [_number(arrays[k], k) for k in PLACE]
         place, times = _places(arrays, n)
         lines = ArrayLines(parts, gain)
-        lost = lost_lines(lines, place, _SLIPPED)
+        lost = lost_lines(looked_through(lines), place, _SLIPPED)
     except ValueError as error:
         raise ValueError(f"'{path}' is not {WHAT}: {error}") from error
     return Recording(path, lines, place, lost, times, first[0], first[1])

@@ -24,6 +24,11 @@ _OFF_GRID = 0.25
 """How far a time may be from the grid of the others, in lines."""
 _ABOUT = 65
 """Pairs of lines to compare with."""
+_TAG_ERROR = 0.05e-3
+"""How far a time that was cut to a resolution may be off it [s]."""
+_FEWEST_TAGS = 24
+"""Lines between slips whose times, cut, tell the time of the first of them to a fifth of a line."""
+_MOST_TAGS = 400
 
 
 class Neighbors:
@@ -48,6 +53,11 @@ class Neighbors:
         self._there.append(np.any(size, axis=1))
         self._alike.append(np.einsum("ij,ij->i", phase[1:], phase[:-1].conj()) / self.n_cells)
         self._last = phase[-1:]
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Size of the correlation of the phases of each line and the next, (n - 1,)."""
+        return np.asarray(np.abs(np.concatenate(self._alike)), np.float64)
 
     @property
     def there(self) -> NDArray[np.bool_]:
@@ -105,7 +115,7 @@ def places_by_number(numbers: FloatArray, name: str) -> NDArray[np.intp]:
         raise ValueError(
             f"'{name}' does not count lines one by one: look at its element {np.argmax(wrong)}"
         )
-    return np.asarray(whole - whole[0], dtype=np.intp)
+    return _not_too_few(np.asarray(whole - whole[0], dtype=np.intp))
 
 
 def places_by_time(times: FloatArray, name: str) -> NDArray[np.intp]:
@@ -124,7 +134,100 @@ def places_by_time(times: FloatArray, name: str) -> NDArray[np.intp]:
         raise ValueError(
             f"'{name}' does not count lines one by one: look at its element {np.argmax(wrong) + 1}"
         )
-    return np.concatenate([[0], np.cumsum(np.rint(counted), dtype=np.intp)])
+    return _not_too_few(np.concatenate([[0], np.cumsum(np.rint(counted), dtype=np.intp)]))
+
+
+def places_by_tags(
+    place: NDArray[np.intp],
+    tags: FloatArray,
+    spacing: float,
+    resolution: float,
+    neighbors: Neighbors,
+) -> NDArray[np.intp]:
+    """Places of lines, moved on where their times say that lines between were lost.
+
+    Times that are cut to less than a line leave the place of a slip open by some lines: it is where
+    neighbors are least alike. How many lines were lost they tell exactly: what is cut off differs
+    from line to line, and the largest remainder of many lines is next to nothing.
+
+    Parameters
+    ----------
+    place : ndarray of int, shape (n,)
+        Counted from 0, without the slips.
+    tags : ndarray, shape (n,)
+        Times, cut to the resolution [s].
+    spacing : float
+        Between lines [s].
+    resolution : float
+        [s]
+    neighbors : Neighbors
+
+    Raises
+    ------
+    ValueError
+        If times run back, or slips are too near to each other.
+    """
+    place, begin = place.copy(), 0
+    while True:
+        since = tags - spacing * place
+        low = np.minimum.accumulate(since[begin:])
+        high = np.maximum.accumulate(since[begin:])
+        wide = np.flatnonzero(high - low > resolution + _TAG_ERROR)
+        if not len(wide):
+            return place
+        seen = begin + int(wide[0])
+        if since[seen] <= low[wide[0]]:
+            raise ValueError(
+                f"the time of line {place[seen] + 1} is too early for lines every "
+                f"{1e3 * spacing:.6g} ms: times, their order or the repetition frequency are wrong"
+            )
+        at, lost = _slip(since, begin, seen, spacing, resolution, neighbors)
+        place[at:] += lost
+        _not_too_few(place)
+        begin = at
+
+
+def _slip(
+    since: FloatArray,
+    begin: int,
+    seen: int,
+    spacing: float,
+    resolution: float,
+    neighbors: Neighbors,
+) -> tuple[int, int]:
+    """First line after a slip that is seen at some line, and how many were lost before it."""
+    after = since[seen : seen + _MOST_TAGS]
+    wide = np.ptp(np.stack([np.minimum.accumulate(after), np.maximum.accumulate(after)]), axis=0)
+    after = after[wide <= resolution + _TAG_ERROR]
+    latest = after.max()
+    first = seen
+    while first > begin + 1 and since[first - 1] >= latest - resolution - _TAG_ERROR:
+        first -= 1
+    before = since[max(begin, first - _MOST_TAGS) : first]
+    lost = (latest - before.max()) / spacing
+    if min(len(before), len(after)) < _FEWEST_TAGS or abs(lost - round(lost)) > _OFF_GRID:
+        raise ValueError(
+            f"lines are lost before line {seen + 1}, and its times do not tell how many"
+        )
+    alike = neighbors.correlation[first - 1 : seen]
+    return first + int(np.argmin(alike)), round(lost)
+
+
+def _not_too_few(place: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The same places; ValueError where too many others lie between them."""
+    n = int(place[-1]) + 1
+    if n - len(place) > MOST_LOST * n:
+        k = int(place[np.argmax(np.diff(place) > 1)]) + 2
+        raise too_many_lost(n - len(place), n, k)
+    return place
+
+
+def too_many_lost(n_lost: int, n: int, first: int) -> ValueError:
+    """What to raise where too many lines are lost."""
+    return ValueError(
+        f"{n_lost} of its {n} lines are missing (zero), the first is line {first}; "
+        f"{MOST_LOST:.0%} of them may be"
+    )
 
 
 def on_grid(times: FloatArray, place: NDArray[np.intp]) -> FloatArray:

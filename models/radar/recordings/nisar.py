@@ -41,6 +41,7 @@ from terrafix.models.radar.recordings.recording import (
     Recording,
     Sent,
     Track,
+    looked_through,
     lost_lines,
     seconds,
 )
@@ -50,6 +51,8 @@ _SLIPPED = "its 'UTCtime' does not say so: have the times corrected by whoever m
 _TOLD = 6
 """Names of what a file of another kind holds that are told."""
 _N_CODES = 65536
+_MOST_COMPRESSED = 300
+"""Samples of echo in a byte at most: zlib makes a thousandth of zeros, which are four bytes each."""
 _EVEN = 1e-4
 """How far ranges may be from even spacing, in cells."""
 _UNIT = 1e-3
@@ -125,15 +128,37 @@ def read_l0b(path: Path, channel: str = "") -> Recording:
         raise ValueError(f"'{path}' is not {WHAT}: {reason}") from error
 
 
-def _recording(path: Path, file: Any, channel: str) -> Recording:
+def l0b_track(path: Path) -> Track:
+    """Track of a file (NISAR L0B, HDF5).
+
+    Raises
+    ------
+    ValueError
+        If it is of another kind, or a part cannot be.
+    """
+    with opened(path) as file:
+        root = _root(file)
+        times = f"{root}/lowRateTelemetry/orbit"
+        if not has_group(file, times):
+            raise ValueError("it has no orbit")
+        return _track(file[root], epoch_of(file[times]["time"]))
+
+
+def _root(file: Any) -> str:
     band = next((b for b in BANDS if has_group(file, f"science/{b}/RRSD/swaths")), None)
     if band is None:
         raise ValueError(_another(file))
-    root = f"science/{band}/RRSD"
+    return f"science/{band}/RRSD"
+
+
+def _recording(path: Path, file: Any, channel: str) -> Recording:
+    root = _root(file)
     name = _chosen(channels(file[f"{root}/swaths"]), channel)
     sent_group, samples = name.rpartition("/rx")[0], f"{root}/swaths/{name}"
     tx = file[f"{root}/swaths/{sent_group}"]
     n, n_cells = shape = _shape(file[samples])
+    if n * n_cells > _MOST_COMPRESSED * path.stat().st_size:
+        raise ValueError(f"it says {n} lines of {n_cells} cells, and has {path.stat().st_size} bytes")
     times = values_of(tx, "UTCtime", (n,))
     epoch = epoch_of(tx["UTCtime"])
     place = places_by_time(times, "UTCtime")
@@ -158,7 +183,14 @@ def _recording(path: Path, file: Any, channel: str) -> Recording:
         *(path, samples, shape, _table(rx, file[samples]), _valid(tx, n), _gain(rx, n))
     )
     return Recording(
-        *(path, lines, place, lost_lines(lines, place, _SLIPPED), line_time, first_line),
+        *(
+            path,
+            lines,
+            place,
+            lost_lines(looked_through(lines), place, _SLIPPED),
+            line_time,
+            first_line,
+        ),
         near_range=float(ranges[0]),
         sent=sent,
         track=_track(file[root], epoch),

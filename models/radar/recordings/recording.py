@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 from terrafix.models.core.arrays import ComplexArray, FloatArray
 from terrafix.models.motion.ephemeris import Ephemeris
 from terrafix.models.radar.chirp import Radar
-from terrafix.models.radar.recordings.lines import MOST_LOST, Neighbors, refuse_slips
+from terrafix.models.radar.recordings.lines import (
+    MOST_LOST,
+    Neighbors,
+    refuse_slips,
+    too_many_lost,
+)
 
 WHAT = "recorded echo"
 FORMATS = (
@@ -25,6 +30,9 @@ FORMATS = (
     "first_rg_cell, or NISAR L0B (HDF5)"
 )
 IMAGE = "an image, formed already: name the raw echo (level 0) that it was formed of"
+_MOVED = 0.07
+"""Lines that an image is moved by where 3 to 10 lines of its aperture are zeros, rms: measured by
+benchmarks/lost_lines.py."""
 _BLOCK = 2**22
 """Samples that are in memory at a time: 32 MB."""
 
@@ -126,6 +134,8 @@ class Recording:
         light.
     sent : Sent, optional
     track : Track, optional
+    time_sigma : float
+        Standard error that the times of all its lines have in common [s].
     """
 
     path: Path
@@ -138,6 +148,7 @@ class Recording:
     near_range: float | None = None
     sent: Sent | None = None
     track: Track | None = None
+    time_sigma: float = 0.0
 
     @property
     def n_lines(self) -> int:
@@ -153,11 +164,10 @@ class Recording:
         """Echo of lines `first` to `last - 1`, counted from 0, (n, n_cells); lost ones are zero."""
         last = self.n_lines if last is None else last
         k, m = (int(i) for i in np.searchsorted(self.place, (first, last)))
-        there = self.lines.read(k, m)
-        if len(there) == last - first:
-            return there
         echo = np.zeros((last - first, self.n_cells), np.complex64)
-        echo[self.place[k:m] - first] = there
+        for begin, end in _spans(m - k, self.n_cells):
+            own = slice(k + begin, k + end)
+            echo[self.place[own] - first] = self.lines.read(own.start, own.stop)
         return echo
 
     def blocks(self) -> Iterator[tuple[int, ComplexArray]]:
@@ -178,6 +188,18 @@ class Recording:
         orbit = self.track.orbit
         return orbit.at(self.line_time + seconds(self.track.epoch - orbit.tags[0]))
 
+    def error_of_times(self, prf: float) -> float:
+        """Standard error of the times of what an image of it shows [s].
+
+        That of the times themselves, and what lines that are lost move an image by.
+
+        Parameters
+        ----------
+        prf : float
+            Pulse repetition frequency [Hz].
+        """
+        return float(np.hypot(self.time_sigma, (_MOVED / prf) if len(self.lost) else 0.0))
+
     def told(self) -> str:
         """What was lost, for messages; empty if nothing was."""
         if not len(self.lost):
@@ -193,21 +215,13 @@ def seconds(span: np.timedelta64) -> float:
     return float(span / np.timedelta64(1, "ns")) * 1e-9
 
 
-def lost_lines(lines: Lines, place: NDArray[np.intp], cure: str) -> NDArray[np.intp]:
-    """Look through lines once: numbers of the lost ones, counted from 1.
-
-    Parameters
-    ----------
-    lines : Lines
-    place : ndarray of int, shape (n,)
-        Line of the recording that each of them is, counted from 0.
-    cure : str
-        What to do about lines that slipped, for the message.
+def looked_through(lines: Lines) -> Neighbors:
+    """Look through lines once: how alike neighbors are, and which are zero.
 
     Raises
     ------
     ValueError
-        If a line is not finite, more than `MOST_LOST` of them are missing, or lines have slipped.
+        If a line is not finite.
     """
     n, n_cells = lines.shape
     neighbors = Neighbors(n_cells)
@@ -217,14 +231,30 @@ def lost_lines(lines: Lines, place: NDArray[np.intp], cure: str) -> NDArray[np.i
             line = first + int(np.argmin(np.isfinite(block).all(axis=1)))
             raise ValueError(f"line {line + 1} of its {n} is not finite")
         neighbors.take(block)
+    return neighbors
+
+
+def lost_lines(neighbors: Neighbors, place: NDArray[np.intp], cure: str) -> NDArray[np.intp]:
+    """Numbers of the lost ones of lines that were looked through, counted from 1.
+
+    Parameters
+    ----------
+    neighbors : Neighbors
+    place : ndarray of int, shape (n,)
+        Line of the recording that each of them is, counted from 0.
+    cure : str
+        What to do about lines that slipped, for the message.
+
+    Raises
+    ------
+    ValueError
+        If more than `MOST_LOST` of them are missing, or lines have slipped.
+    """
     there = np.zeros(int(place[-1]) + 1, np.bool_)
     there[place] = neighbors.there
     n_lost = int(np.sum(~there))
     if n_lost > MOST_LOST * len(there):
-        raise ValueError(
-            f"{n_lost} of its {len(there)} lines are missing (zero), the first is line "
-            f"{int(np.argmin(there)) + 1}; {MOST_LOST:.0%} of them may be"
-        )
+        raise too_many_lost(n_lost, len(there), int(np.argmin(there)) + 1)
     refuse_slips(neighbors, place, cure)
     return np.flatnonzero(~there) + 1
 

@@ -104,9 +104,12 @@ def test_lines_are_published_when_and_where_they_were_received(
     members = np.arange(1)
     component.bind(Environment("echo", 0, members, members >= 0, lambda *_: None, False))
     sent = []
-    monkeypatch.setattr(component, "_publish", lambda *args: sent.append(args))
+    monkeypatch.setattr(component, "_publish", lambda *args, **more: sent.append((*args, more)))
     component.step(0.1, 0.1)
-    t, echo, first_time, first_range = sent[0]
+    t, echo, first_time, first_range, more = sent[0]
+    # 0.07 lines rms are what zeros in the place of lost lines move an image by
+    expected = 0.07 / PRF if files == "b.h5" else 0.0
+    assert more["time_sigma"] == pytest.approx(expected, rel=1e-9)
     assert t == 0.1
     assert first_time == pytest.approx(20 / PRF, abs=1e-9)
     assert first_range == pytest.approx(near, abs=1e-6)
@@ -115,3 +118,16 @@ def test_lines_are_published_when_and_where_they_were_received(
     component.step_index = 0
     with pytest.raises(ConfigurationError, match="its lines were received from"):
         component.step(1.0, 1.0)
+
+
+def test_a_channel_is_named_where_there_are_several(tmp_path):
+    """And refused where a file has none."""
+    write(tmp_path / "two.h5", codes(beam(N, CELLS)), rx=("HH", "HV"))
+    np.savez(tmp_path / "c.npz", echo=beam(N, CELLS), first_rg_line=7, first_rg_cell=3)
+    with pytest.raises(ConfigurationError, match="it has several channels: A/HH, A/HV"):
+        radar(tmp_path, "two.h5").validate()
+    radar(tmp_path, "two.h5", channel="A/HV").validate()
+    with pytest.raises(ConfigurationError, match="it has no channel 'A/VV'; it has A/HH, A/HV"):
+        radar(tmp_path, "two.h5", channel="A/VV").validate()
+    with pytest.raises(ConfigurationError, match=r"c\.npz' has no channels: 'A/HH' need not be"):
+        radar(tmp_path, "c.npz", channel="A/HH", **SENT, range0=990e3).validate()

@@ -1,5 +1,7 @@
 """Phase history: points of exact geometry, and the recorded one of the Gotcha set."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -116,3 +118,54 @@ def test_a_wrong_track_is_recovered_from_another_aspect(dp, dv, gotcha, aircraft
     for wrong in (image[::-1], image[:, ::-1], image[::-1, ::-1]):
         other = shift_between(np.ascontiguousarray(wrong), reference, REACH)
         assert other.quality < GATE or other.parts < PARTS
+
+
+def _width(line, step):
+    """Where a peak falls to half of its power, between samples."""
+    top, least = int(line.argmax()), line.max() / np.sqrt(2)
+    sides = []
+    for side in (line[top::-1], line[top:]):
+        k = int(np.argmax(side < least))
+        sides.append(k - (least - side[k]) / (side[k - 1] - side[k]))
+    return sum(sides) * step
+
+
+def test_the_car_park_is_as_sharp_as_theory_says(data_folder, aircraft):
+    """The two brightest points of four degrees of aspect, which stand alone, within 10 %.
+
+    Between half powers, a band weighted by Hamming's window is 1.303 c / 2B wide, 1.303 lambda /
+    (2 dtheta) across it; on the ground the slant is divided by the cosine of the depression, and
+    the angle seen is that in the plane of the ground.
+    """
+    folder = data_folder / "afrl_gotcha"
+    if not folder.is_dir():
+        pytest.skip(f"no phase history: {folder} is absent")
+    history = read_gotcha([folder / f"data_3dsar_pass1_az00{k}_HH.mat" for k in (1, 2, 3, 4)])
+    level = np.linalg.norm(history.r[:, :2], axis=1)
+    slope = np.cos(np.arctan2(history.r[:, 2], level).mean())
+    n, k = history.phase.shape
+    band = (history.frequency[-1] - history.frequency[0]) * k / (k - 1)
+    east, north = history.r[:, 0], history.r[:, 1]
+    angle = np.ptp(np.unwrap(np.arctan2(north, east))) * n / (n - 1)
+    pulses = compressed_pulses(history)
+    grid = ground_grid(history.r, 0.4, 250, 250)
+    image = projected(pulses, grid, aircraft.SUMS)
+    theory = {
+        "out": 1.303 * SPEED_OF_LIGHT / (2 * band * slope),
+        "along": 1.303 * history.wavelength / (2 * angle * slope),
+    }
+    weighted = replace(pulses, echo=pulses.echo * np.hamming(n).astype(np.float32)[:, None])
+    step = 0.02
+    at = step * np.arange(-60, 61)
+    for _ in range(2):
+        row, column = np.unravel_index(image.argmax(), image.shape)
+        place = grid.places()[image.argmax()]
+        image[row - 5 : row + 6, column - 5 : column + 6] = 0
+        for axis in (grid.along, grid.out, grid.along, grid.out):
+            line = np.abs(aircraft.SUMS.back_projected(weighted, place + at[:, None] * axis))
+            near = np.abs(at) < 0.6
+            place = place + at[near][line[near].argmax()] * axis
+        for name, expected in theory.items():
+            axis = getattr(grid, name)
+            line = np.abs(aircraft.SUMS.back_projected(weighted, place + at[:, None] * axis))
+            assert _width(line, step) == pytest.approx(expected, rel=0.1), name
