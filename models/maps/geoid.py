@@ -89,7 +89,6 @@ def on_ellipsoid(dem: Dem, source: str = GRID) -> Dem:
         return dem
     if not dem.datum:
         raise ValueError(f"nothing says what the heights of {dem.name} refer to")
-    undulation, sigma = undulation_of(dem.datum, source)
     latitude, longitude = (
         first + step * np.arange(n)
         for first, step, n in (
@@ -97,6 +96,8 @@ def on_ellipsoid(dem: Dem, source: str = GRID) -> Dem:
             (dem.longitude0, dem.longitude_step, dem.height.shape[1]),
         )
     )
+    area = tuple(float(np.degrees(a[k])) for k in (0, -1) for a in (longitude, latitude))
+    undulation, sigma = undulation_of(dem.datum, source, area)
     coarse = [np.linspace(a[0], a[-1], _looked_up(a)) for a in (latitude, longitude)]
     N = undulation(*(np.asarray(a) for a in np.meshgrid(*coarse, indexing="ij")))
     if not np.isfinite(N).all():
@@ -119,8 +120,19 @@ def _linear(x: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(values[k] * (1 - w) + values[k + 1] * w)
 
 
-def undulation_of(datum: str, source: str = GRID) -> tuple[Undulation, float]:
+def undulation_of(
+    datum: str, source: str = GRID, area: tuple[float, ...] | None = None
+) -> tuple[Undulation, float]:
     """Height of a vertical datum above the ellipsoid, and its standard error [m].
+
+    Parameters
+    ----------
+    datum : str
+        As of `Dem`.
+    source : str
+        Of the geoid, one of `GEOIDS`.
+    area : tuple of float, optional
+        West, south, east, north [deg] of where it is wanted.
 
     Raises
     ------
@@ -128,7 +140,7 @@ def undulation_of(datum: str, source: str = GRID) -> tuple[Undulation, float]:
         If it is not to be had.
     """
     if datum not in _GRIDS:
-        return _other_system(datum), _SIGMAS[GRID]
+        return _other_system(datum, area), _SIGMAS[GRID]
     if source == HARMONICS:
         return harmonic_undulation, _SIGMAS[HARMONICS]
     found = _by_proj(_GRIDS[datum])
@@ -165,7 +177,7 @@ def _risen(height: Any) -> FloatArray:
     return np.asarray(height, np.float64)
 
 
-def _other_system(datum: str) -> Undulation:
+def _other_system(datum: str, area: tuple[float, ...] | None) -> Undulation:
     """Undulation of a vertical system of EPSG, by PROJ."""
     pyproj = optional("pyproj.transformer", "a vertical datum", extra="sar")
     code = datum.removeprefix("EPSG:")
@@ -173,16 +185,18 @@ def _other_system(datum: str) -> Undulation:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what is unavailable: told here
         group = pyproj.TransformerGroup(
-            f"EPSG:4326+{code}", "EPSG:4979", always_xy=True, allow_ballpark=False
+            f"EPSG:4326+{code}",
+            "EPSG:4979",
+            always_xy=True,
+            allow_ballpark=False,
+            area_of_interest=area and pyproj.AreaOfInterest(*area),
         )
-    usable = [t for t in group.transformers if "grid" in t.definition]
+    usable = [t for t in group.transformers if "vgridshift" in t.definition]
     if not usable or not group.best_available:
-        grids = {
-            g.short_name for o in group.unavailable_operations for g in o.grids if g.short_name
-        }
+        missing = [g.short_name for o in group.unavailable_operations[:1] for g in o.grids]
         raise ValueError(
             f"PROJ has no grid that turns heights of {name} ({datum}) to the ellipsoid\n  "
-            + (f"fetch one: projsync --file {sorted(grids)[0]}" if grids else "convert them")
+            + (f"fetch it (projsync --file): {', '.join(missing)}" if missing else "convert them")
         )
     best = usable[0]
 

@@ -178,7 +178,7 @@ class Raster:
             )
         values, known = np.zeros(n, np.float32), np.zeros(n, np.bool_)
         strip = max(1, _STRIP // max(1, n[1] * step * step))
-        with self._opened() as dataset:
+        with opened(self.path) as dataset:
             for first in range(0, n[0], strip):
                 part = slice(first, min(first + strip, n[0]))
                 lines = slice(rows.start + part.start * step, rows.start + part.stop * step)
@@ -244,25 +244,18 @@ class Raster:
             )
         if group.transformers and 0 <= group.transformers[0].accuracy <= _WORST:
             return group.transformers[0]
-        grids = {
-            g.short_name for o in group.unavailable_operations for g in o.grids if g.short_name
-        }
-        raise ValueError(
-            f"'{self.path}' is in {from_crs.name}, which PROJ turns to WGS-84 "
-            + (
-                f"with an error of {group.transformers[0].accuracy:g} m"
-                if group.transformers
-                else "by no known way"
-            )
-            + f", more than {_WORST:g} m\n  "
-            + (f"fetch a grid of it (projsync --file {sorted(grids)[0]}), or " if grids else "")
-            + "warp it to WGS-84 where its grids are (gdalwarp -t_srs EPSG:4326)"
+        error = (
+            f"with an error of {group.transformers[0].accuracy:g} m"
+            if group.transformers
+            else "by no way that it knows"
         )
-
-    @contextmanager
-    def _opened(self) -> Iterator[Any]:
-        with _dataset(self.path) as dataset:
-            yield dataset
+        missing = [g.short_name for o in group.unavailable_operations[:1] for g in o.grids]
+        fetch = f"fetch its grid (projsync --file): {', '.join(missing)}; or " if missing else ""
+        raise ValueError(
+            f"'{self.path}' is in {from_crs.name}, which PROJ turns to WGS-84 {error}; at most "
+            f"{_WORST:g} m are taken\n  {fetch}warp it to WGS-84 (gdalwarp -t_srs EPSG:4326) where "
+            "its grid is"
+        )
 
     def _raw(
         self, dataset: Any, rows: slice, first_column: int, n_columns: int
@@ -319,7 +312,7 @@ def open_raster(path: Path) -> Raster:
     """
     if not path.is_file():
         raise FileNotFoundError(f"'{path}' {'is a folder' if path.is_dir() else 'is not there'}")
-    with _dataset(path) as dataset:
+    with opened(path) as dataset:
         _check_band(dataset, path)
         crs, vertical = _systems(dataset, path)
         tags = dataset.tags()
@@ -414,8 +407,14 @@ def _vertical(upward: Any, path: Path) -> str:
 
 
 @contextmanager
-def _dataset(path: Path) -> Iterator[Any]:
-    """Open a file, with errors that say what it is."""
+def opened(path: Path) -> Iterator[Any]:
+    """A file as a dataset of rasterio, open meanwhile.
+
+    Raises
+    ------
+    ValueError
+        If it is no raster; the message says what it is.
+    """
     rasterio = _rasterio()
     _pyproj()
     driver = SUFFIXES.get(path.suffix.lower())

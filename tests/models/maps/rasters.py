@@ -32,4 +32,6 @@ def write(path, values, transform, crs=UTM, **profile):
 
 def turned(spacing, angle_deg, origin=ORIGIN):
     """A north-up grid turned clockwise about its first corner."""
-    return Affine.translation(*origin) @ Affine.rotation(-angle_deg) @ Affine.scale(spacing, -spacing)
+    return (
+        Affine.translation(*origin) @ Affine.rotation(-angle_deg) @ Affine.scale(spacing, -spacing)
+    )

@@ -81,8 +81,9 @@ def test_nodata_masks_and_scale_are_those_of_the_file(tmp_path):
 
 def _profile(dtype, transform):
     return {
-        **{"driver": "GTiff", "count": 1, "height": 20, "width": 30, "dtype": dtype},
-        **{"crs": rasters.UTM, "transform": transform},
+        "driver": "GTiff", "count": 1, "height": 20, "width": 30, "dtype": dtype,
+        "crs": rasters.UTM,
+        "transform": transform,
     }
 
 
@@ -190,7 +191,9 @@ def test_a_damaged_file_says_so(tmp_path):
 
 def test_a_place_elsewhere_and_a_window_too_large_are_refused(tmp_path):
     raster = open_raster(write(tmp_path / "m.tif", RAMP, turned(10.0, 0.0)))
-    with pytest.raises(ValueError, match=r"does not cover latitude 37\.000, longitude -80\.000") as e:
+    with pytest.raises(
+        ValueError, match=r"does not cover latitude 37\.000, longitude -80\.000"
+    ) as e:
         raster.window(np.radians([37.0]), np.radians([-80.0]))
     assert "it covers latitude 36.143 to 36.145, longitude -81.000 to -80.997 deg" in str(e.value)
     with pytest.raises(ValueError, match=r"10000 x 10000 pixels is too large; 64 million"):
