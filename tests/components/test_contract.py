@@ -29,6 +29,7 @@ TYPES = sorted(n for n, e in component_entries().items() if e.value.startswith("
 IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("earlier_pass", "image_album", "image_former", "image_matcher"),
     *("recorded_echo", "recorded_reference", "reference_file", "scene_echo", "terrain"),
+    *("elevation_map", "reference_map"),  # in images/test_maps
     *("aircraft_radar", "aperture_former", "aperture_matcher"),
     "earlier_flight",  # in systems/test_aircraft_sar
     *("recorded_spotlight", "spotlight_matcher", "spotlight_evaluation"),  # in test_aircraft_gotcha
@@ -64,7 +65,15 @@ FOREIGN = {"elements", "fmu", "fmu_loop", "linear"}  # whose ports come from fil
 BASES = {  # of which types are made
     "Dated",
     *("EnsembleCorrect", "FilterAcquisition", "FilterCorrect", "FilterEvaluation", "FilterMonitor"),
-    *("FilterPredict", "FilterSensor", "FilterTruth", "NoisyComponent", "OnGround", "OnReference"),
+    *(
+        "FilterPredict",
+        "FilterSensor",
+        "FilterTruth",
+        "InView",
+        "NoisyComponent",
+        "OnGround",
+        "OnReference",
+    ),
     *("Optics", "Playback", "SendsChirps"),
 }
 SIZES = (1, 100)

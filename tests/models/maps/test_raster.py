@@ -81,7 +81,11 @@ def test_nodata_masks_and_scale_are_those_of_the_file(tmp_path):
 
 def _profile(dtype, transform):
     return {
-        "driver": "GTiff", "count": 1, "height": 20, "width": 30, "dtype": dtype,
+        "driver": "GTiff",
+        "count": 1,
+        "height": 20,
+        "width": 30,
+        "dtype": dtype,
         "crs": rasters.UTM,
         "transform": transform,
     }
