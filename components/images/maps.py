@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from terrafix.components.fields import GRID, HEIGHT
-from terrafix.components.images.reference import _Reference
+from terrafix.components.images.reference import ReferenceSource
 from terrafix.components.shared import common, require_common
 from terrafix.components.truth.terrain import Terrain, referred
 from terrafix.cosim.basics.clock import Rate
@@ -69,7 +69,7 @@ class InView(Component):
         return latitude, longitude
 
 
-class ReferenceMap(InView, _Reference):
+class ReferenceMap(InView, ReferenceSource):
     """Reference that is a part of a map: a GeoTIFF of amplitudes, or an image of Sentinel-1.
 
     Heights of its tie points are those of the terrain, which has to cover it: a square that is

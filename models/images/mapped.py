@@ -209,6 +209,6 @@ def _require_seen(name: str, known: np.ndarray, row: FloatArray, column: FloatAr
     seen[inside] = known[row[inside].astype(np.intp), column[inside].astype(np.intp)]
     if seen.mean() < SEEN:
         raise ValueError(
-            f"'{name}' knows {100 * seen.mean():.0f} % of what is asked for; {100 * SEEN:.0f} % are "
-            "wanted\n  use a map that covers it, or a smaller reach"
+            f"'{name}' knows {100 * seen.mean():.0f} % of what is asked for; {100 * SEEN:.0f} % "
+            "are wanted\n  use a map that covers it, or a smaller reach"
         )

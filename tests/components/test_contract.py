@@ -74,7 +74,7 @@ BASES = {  # of which types are made
         "OnGround",
         "OnReference",
     ),
-    *("Optics", "Playback", "SendsChirps"),
+    *("Optics", "Playback", "ReferenceSource", "SendsChirps"),
 }
 SIZES = (1, 100)
 STEP, HALF, WHOLE = "0.1", "0.8", "1.6"  # [s]
