@@ -144,8 +144,8 @@ def annotation(path, kind, n_lines, n_samples, bursts=(), valid=None):
             t = starts[b] + (line - b * n) * LINE + 1e-4
             points.append(
                 f"<geolocationGridPoint><azimuthTime>{moment(t)}</azimuthTime><slantRangeTime>"
-                f"{float(2 * R / SPEED_OF_LIGHT)!r}</slantRangeTime><line>{line}</line><pixel>{sample}"
-                "</pixel><latitude>0</latitude><longitude>0</longitude><height>0</height>"
+                f"{float(2 * R / SPEED_OF_LIGHT)!r}</slantRangeTime><line>{line}</line>"
+                f"<pixel>{sample}</pixel><latitude>0</latitude><longitude>0</longitude><height>0</height>"
                 "</geolocationGridPoint>"
             )
     burst = "".join(
