@@ -44,7 +44,7 @@ NAVIGATION = {
 LATE = (
     "casadi scipy xarray pint matplotlib netCDF4 rich cv2 fmpy "
     "psutil filelock platformdirs tomlkit jinja2 shapely contourpy "
-    "erfa sgp4 pymsis brahe astropy_iers_data"
+    "erfa sgp4 pymsis brahe astropy_iers_data rasterio pyproj sarkit"
 )
 HEAVY = {
     "terrafix": f"numpy click {LATE}",

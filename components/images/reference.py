@@ -50,7 +50,7 @@ _TRACK_STEP = 0.02
 """Between places of an earlier flight [s]."""
 
 
-class _Reference(Component):
+class ReferenceSource(Component):
     """Base of references: their ports."""
 
     default_rate = Rate("8.2", offset="8.2")
@@ -97,7 +97,7 @@ def reference_from(
     return Reference(amplitude, rows, columns, *np.moveaxis(places, -1, 0))
 
 
-class EarlierPass(_Reference):
+class EarlierPass(ReferenceSource):
     """Reference of an earlier pass over an artificial scene, with speckle of its own.
 
     What an ideal processor makes of the scatterers, and not formed from echo; its orbit is that
@@ -207,7 +207,7 @@ class RenderedReference(EarlierPass):
         return rendered(cover, footprint, looks, snr_db, displaced=(north, east))
 
 
-class EarlierFlight(_Reference, OnGround):
+class EarlierFlight(ReferenceSource, OnGround):
     """Reference of an earlier flight over an artificial scene, with speckle of its own.
 
     As `EarlierPass`, of a straight piece of a track, displaced, about where the given one is when
@@ -289,7 +289,7 @@ class EarlierFlight(_Reference, OnGround):
         self._publish(reference)
 
 
-class RecordedReference(_Reference):
+class RecordedReference(ReferenceSource):
     """Reference formed from recorded echo, of a part of its Doppler band, and geocoded.
 
     The velocity that focuses it is found by autofocus, once, for all. It is geocoded with the
@@ -382,7 +382,7 @@ class RecordedReference(_Reference):
         self._publish(reference)
 
 
-class ReferenceFile(_Reference):
+class ReferenceFile(ReferenceSource):
     """References from files, as `terrafix.models.images.reference.write_reference` writes them."""
 
     folder = FilePath(doc="where the files are")

@@ -17,21 +17,26 @@ from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFileP
 from terrafix.cosim.declare.ports import SharedOutput
 from terrafix.models.core.arrays import Single
 from terrafix.models.maps.dem import (
+    DATUMS,
+    ELLIPSOID,
     HIGHEST,
     LOWEST,
     Dem,
     dem_from,
     flat_dem,
-    read_dem,
     read_jacksboro,
     rolling_dem,
     roughened,
 )
+from terrafix.models.maps.elevation import read_elevations
+from terrafix.models.maps.geoid import GEOIDS, on_ellipsoid
 from terrafix.models.radar.cover import COVERS
 from terrafix.models.radar.scene import Scene
 
 _log = logging.getLogger(__name__)
 SOURCES = ("file", "jacksboro", "flat", "hills")
+AS_IN_FILE = "as in the file"
+_OF_FILES = ("dem_file", "vertical_datum", "geoid")
 _UNREAD = {
     "texture": ("parcels", "point_density", "point_brightness"),
     "urban": ("point_density",),
@@ -44,7 +49,8 @@ _OF_ERRORS = ("error_length", "error_seed")
 class Terrain(Component):
     """Elevation model and surface, told once at t = 0 to all who need them.
 
-    Heights are those of the file; the undulation of the geoid is not added.
+    Heights are told above the ellipsoid. Those of a file that count from a geoid are turned to it;
+    a file that does not say what its heights refer to is refused unless `vertical_datum` does.
     """
 
     default_rate = Rate(times=["0"])
@@ -54,7 +60,13 @@ class Terrain(Component):
         "file",
         doc="file; jacksboro: the real one that comes with matplotlib; flat: one height; hills",
     )
-    dem_file = OptionalFilePath(doc="tile of SRTM (.hgt) or arrays (.npz)")
+    dem_file = OptionalFilePath(doc="tile of SRTM (.hgt), GeoTIFF or DTED (.dt2), arrays (.npz)")
+    vertical_datum = Choice(
+        (AS_IN_FILE, *DATUMS), AS_IN_FILE, doc="what heights of the file refer to (file)"
+    )
+    geoid = Choice(
+        GEOIDS, GEOIDS[0], doc="where a geoid comes from: its grid, or shipped harmonics (file)"
+    )
     flat_height = Parameter(
         0.0, unit="m", minimum=LOWEST, maximum=HIGHEST, doc="height everywhere (flat); 0 is the sea"
     )
@@ -103,11 +115,13 @@ class Terrain(Component):
                 f"  set {self.name}.dem_file, or {self.name}.source to jacksboro or flat"
             )
         try:
-            dem = read_jacksboro() if source == "jacksboro" else read_dem(path)
+            dem = (
+                read_jacksboro() if source == "jacksboro" else referred(self, read_elevations(path))
+            )
             if self.setting("fill_voids"):
                 self._n_filled = dem.n_void
             dem = dem.filled() if self._n_filled else dem
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, ImportError) as error:
             raise ConfigurationError(
                 f"'{self.name}' cannot read its elevation model: {error}\n"
                 f"  set {self.name}.dem_file to another"
@@ -159,6 +173,9 @@ class Terrain(Component):
             return bool(self.setting("source") != "flat")
         if name in _OF_ERRORS:
             return self.takes("error") and float(self.setting("error")) > 0
+        if name in _OF_FILES:
+            stated = name == "geoid" and self.setting("vertical_datum") == ELLIPSOID
+            return self.setting("source") == "file" and not stated
         return super().takes(name) and not (hills and name in ("mirrored", "fill_voids"))
 
     def _initialize_impl(self) -> None:
@@ -197,6 +214,31 @@ class Terrain(Component):
 
     def _step_impl(self, t: float, dt: float) -> None:
         """Say nothing more."""
+
+
+def referred(component: Component, dem: Dem) -> Dem:
+    """Heights of a file above the ellipsoid, by a component's settings.
+
+    Raises
+    ------
+    ValueError
+        If nothing says what they refer to, file and setting contradict each other, or a geoid is
+        not to be had.
+    """
+    stated = component.setting("vertical_datum")
+    if stated != AS_IN_FILE:
+        if dem.datum not in ("", stated):
+            raise ValueError(
+                f"{component.name}.vertical_datum is {stated}, but '{dem.name}' says that its "
+                f"heights refer to {dem.datum}\n  leave it out"
+            )
+        dem = replace(dem, datum=stated)
+    if not dem.datum:
+        raise ValueError(
+            f"'{dem.name}' does not say what its heights refer to: a geoid is up to 107 m off the "
+            f"ellipsoid\n  set {component.name}.vertical_datum to {', '.join(DATUMS)}"
+        )
+    return on_ellipsoid(dem, component.setting("geoid"))
 
 
 def scene_from(height: Single, grid: FloatArray, surface: FloatArray) -> Scene:

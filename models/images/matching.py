@@ -553,9 +553,7 @@ def _allowed(shifts: list[FloatArray], covariance: FloatArray) -> NDArray[np.boo
     return np.asarray(square <= _SIGMAS**2)
 
 
-def _standing_out(
-    surface: Single, allowed: NDArray[np.bool_]
-) -> tuple[int, int, float] | None:
+def _standing_out(surface: Single, allowed: NDArray[np.bool_]) -> tuple[int, int, float] | None:
     """The highest allowed peak, and the chance that a wrong one stands out as much."""
     where = np.where(allowed, surface, -np.inf)
     i, j = (int(k) for k in np.unravel_index(where.argmax(), where.shape))

@@ -149,7 +149,9 @@ def _uncertainty(
             *(view.slant_range, view.column_range, view.sine * speed, view.side),
         )
         shift = (other.points(rows, columns, at) - own) @ onto.T
-        moved.append(np.linalg.lstsq(design, np.r_[shift[..., 0].ravel(), shift[..., 1].ravel()])[0])
+        moved.append(
+            np.linalg.lstsq(design, np.r_[shift[..., 0].ravel(), shift[..., 1].ravel()])[0]
+        )
     M = np.reshape(moved, (-1, 4))
     C = M.T @ M
     measured = np.square([view.time_sigma / view.row_time, view.range_sigma / view.column_range])

@@ -1,8 +1,8 @@
 r"""Digital elevation models: the height of the ground on a grid of latitude and longitude.
 
-Between the points of the grid height is bilinear. Heights are taken as a file gives them; those of
-SRTM are above mean sea level, and what lies between that and the ellipsoid (the undulation of the
-geoid, some -30 m over the eastern United States) is not added.
+Between the points of the grid height is bilinear. What heights refer to goes with them: those of
+SRTM count from the geoid EGM96. Everything that is computed with heights wants them above the
+ellipsoid; `terrafix.models.maps.geoid` turns them to it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,16 @@ from terrafix.models.geometry.earth import EARTH
 
 KEYS = ("height_m", "latitude0_deg", "longitude0_deg", "latitude_step_deg", "longitude_step_deg")
 """Arrays in a file of `write_dem`."""
+_EPSG = "vertical_epsg"
+"""And a number in it that may be absent: what heights refer to."""
 JACKSBORO = "jacksboro"
 """Name of the elevation model that comes with matplotlib: 36.3 N, 84.25 W, of SRTM."""
 
 VOIDS = (-32768.0, -32767.0, -9999.0)
 """What files write where no height is known: SRTM, DTED, and most others."""
+ELLIPSOID = "ellipsoid"
+DATUMS = {ELLIPSOID: 4979, "EGM96": 5773, "EGM2008": 3855}
+"""What heights may refer to, and the code of it (EPSG)."""
 LOWEST, HIGHEST = -12_000.0, 9_000.0
 """Bounds of the Earth's heights and depths [m]: the Challenger Deep and Everest lie within."""
 
@@ -49,6 +54,11 @@ class Dem:
     mirrored : bool
         Whether the grid goes on for ever in mirror images of itself: an artificial world without
         seams, and without borders.
+    datum : str
+        What heights refer to: of `DATUMS`, "EPSG:..." of another vertical system, or empty where
+        nothing says it.
+    sigma : float
+        Standard error of the heights [m], where it is stated; NaN elsewhere.
 
     Raises
     ------
@@ -63,6 +73,8 @@ class Dem:
     longitude_step: float
     name: str = "the elevation model"
     mirrored: bool = False
+    datum: str = ELLIPSOID
+    sigma: float = np.nan
 
     def __post_init__(self) -> None:
         if self.height.ndim != 2 or min(self.height.shape) < 2:
@@ -317,8 +329,14 @@ def roughened(dem: Dem, rms: float, length: float, seed: int) -> Dem:
     return replace(dem, height=dem.height + errors.astype(np.float32))
 
 
-def _heights(raw: NDArray[Any], path: Path) -> Single:
-    """Heights as a file holds them, voids as NaN; what the Earth does not have is refused."""
+def heights_of_the_earth(raw: NDArray[Any], path: Path) -> Single:
+    """Heights as a file holds them, voids as NaN.
+
+    Raises
+    ------
+    ValueError
+        If there is one that the Earth does not have.
+    """
     height = np.array(raw, np.float32)
     height[np.isin(height, np.array(VOIDS, np.float32))] = np.nan
     wrong = (height < LOWEST) | (height > HIGHEST)
@@ -335,7 +353,8 @@ def _heights(raw: NDArray[Any], path: Path) -> Single:
 def read_hgt(path: Path) -> Dem:
     """Read a tile of SRTM (.hgt): big-endian 16-bit, 1201 or 3601 square, `VOIDS` where void.
 
-    The name (N44W072) gives its southwestern corner; its first row is the northernmost.
+    The name (N44W072) gives its southwestern corner; its first row is the northernmost. Heights are
+    above EGM96, by SRTM's definition.
 
     Raises
     ------
@@ -358,12 +377,13 @@ def read_hgt(path: Path) -> Dem:
         )
     n = _SIZES[size]
     raw = np.fromfile(path, ">i2").reshape(n, n)[::-1]
-    height = _heights(raw, path)
+    height = heights_of_the_earth(raw, path)
     ns, lat, ew, lon = found.groups()
     south = int(lat) * (1 if ns == "N" else -1)
     west = int(lon) * (1 if ew == "E" else -1)
     step = float(np.radians(1 / (n - 1)))
-    return Dem(height, float(np.radians(south)), float(np.radians(west)), step, step, path.name)
+    corner = float(np.radians(south)), float(np.radians(west))
+    return Dem(height, *corner, step, step, path.name, datum="EGM96")
 
 
 def read_jacksboro() -> Dem:
@@ -372,7 +392,8 @@ def read_jacksboro() -> Dem:
     Row 0 of the file is the northernmost and its bounds are those of the outer points' cells. Its
     ``ymax`` is the northern border; its ``ymin`` lies one height of the model *north* of that, by
     a wrong sign, so the southern border is formed from the step: Cross Mountain, the summit, then
-    lies at 36.198 N, 84.231 W, where it is.
+    lies at 36.198 N, 84.231 W, where it is. What its heights refer to is not documented; they are
+    taken to be above the ellipsoid.
     """
     from matplotlib import cbook
 
@@ -399,7 +420,17 @@ def write_dem(dem: Dem, path: Path) -> None:
         longitude0_deg=np.degrees(dem.longitude0),
         latitude_step_deg=np.degrees(dem.latitude_step),
         longitude_step_deg=np.degrees(dem.longitude_step),
+        **({_EPSG: dem_code(dem)} if dem.datum else {}),
     )
+
+
+def dem_code(dem: Dem) -> int:
+    """Code (EPSG) of what heights refer to."""
+    return DATUMS.get(dem.datum) or int(dem.datum.removeprefix("EPSG:"))
+
+
+def _datum(code: int) -> str:
+    return next((name for name, c in DATUMS.items() if c == code), f"EPSG:{code}")
 
 
 def read_dem(path: Path) -> Dem:
@@ -417,13 +448,15 @@ def read_dem(path: Path) -> Dem:
     if path.suffix.lower() != ".npz":
         found, cure = kind_of(path)
         raise ValueError(
-            f"'{path}' is no elevation model: a tile of SRTM (.hgt) or arrays (.npz)"
-            + (f"\n  it is {found}: {cure}" if found else "")
+            f"'{path}' is no elevation model: a tile of SRTM (.hgt), arrays (.npz), or a raster "
+            "(.tif, .dt0, .dt1, .dt2, .vrt)" + (f"\n  it is {found}: {cure}" if found else "")
         )
-    arrays = read_arrays(path, KEYS, "an elevation model")
+    arrays = read_arrays(path, KEYS, "an elevation model", (_EPSG,))
+    datum = _datum(int(arrays[_EPSG])) if _EPSG in arrays else ""
     try:
         south, west, north, east = (float(np.radians(float(arrays[k]))) for k in KEYS[1:])
-        return Dem(_heights(arrays["height_m"], path), south, west, north, east, path.name)
+        height = heights_of_the_earth(arrays["height_m"], path)
+        return Dem(height, south, west, north, east, path.name, datum=datum)
     except (TypeError, ValueError) as error:
         told = str(error)
         raise ValueError(told if str(path) in told else f"'{path}': {told}") from error

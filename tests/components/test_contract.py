@@ -30,6 +30,7 @@ IMAGING = {  # whose inputs are images and maps: flown in test_imaging
     *("earlier_pass", "image_album", "image_former", "image_matcher"),
     *("recorded_echo", "recorded_reference", "reference_file", "scene_echo", "terrain"),
     "rendered_reference",
+    *("elevation_map", "reference_map"),  # in images/test_maps
     *("aircraft_radar", "aperture_former", "aperture_matcher"),
     "earlier_flight",  # in systems/test_aircraft_sar
     *("recorded_spotlight", "spotlight_matcher", "spotlight_evaluation"),  # in test_aircraft_gotcha
@@ -65,8 +66,16 @@ FOREIGN = {"elements", "fmu", "fmu_loop", "linear"}  # whose ports come from fil
 BASES = {  # of which types are made
     "Dated",
     *("EnsembleCorrect", "FilterAcquisition", "FilterCorrect", "FilterEvaluation", "FilterMonitor"),
-    *("FilterPredict", "FilterSensor", "FilterTruth", "NoisyComponent", "OnGround", "OnReference"),
-    *("Optics", "Playback", "SendsChirps"),
+    *(
+        "FilterPredict",
+        "FilterSensor",
+        "FilterTruth",
+        "InView",
+        "NoisyComponent",
+        "OnGround",
+        "OnReference",
+    ),
+    *("Optics", "Playback", "ReferenceSource", "SendsChirps"),
 }
 SIZES = (1, 100)
 STEP, HALF, WHOLE = "0.1", "0.8", "1.6"  # [s]

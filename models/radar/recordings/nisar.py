@@ -158,7 +158,9 @@ def _recording(path: Path, file: Any, channel: str) -> Recording:
     tx = file[f"{root}/swaths/{sent_group}"]
     n, n_cells = shape = _shape(file[samples])
     if n * n_cells > _MOST_COMPRESSED * path.stat().st_size:
-        raise ValueError(f"it says {n} lines of {n_cells} cells, and has {path.stat().st_size} bytes")
+        raise ValueError(
+            f"it says {n} lines of {n_cells} cells, and has {path.stat().st_size} bytes"
+        )
     times = values_of(tx, "UTCtime", (n,))
     epoch = epoch_of(tx["UTCtime"])
     place = places_by_time(times, "UTCtime")

@@ -169,9 +169,9 @@ def test_bad_files_are_refused_by_name(tmp_path):
         read_dem(short)
     with pytest.raises(ValueError, match=r"its name must give the southwestern corner, as N44W072"):
         read_dem(hgt(tmp_path, "tile.hgt"))
-    other = tmp_path / "map.tif"
+    other = tmp_path / "map.grd"
     other.write_bytes(b"II*\0")
-    with pytest.raises(ValueError, match=r"no elevation model: a tile of SRTM \(\.hgt\) or arrays"):
+    with pytest.raises(ValueError, match=r"no elevation model: a tile of SRTM \(\.hgt\), arrays"):
         read_dem(other)
     np.savez(tmp_path / "map.npz", heights=np.zeros((3, 3)))
     with pytest.raises(ValueError, match="it has no 'height_m'; it holds heights"):

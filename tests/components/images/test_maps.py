@@ -1,0 +1,298 @@
+"""Parts of maps as components: where the beam looks, in any system; bad ones get one error."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rasterio", reason="of the extra 'sar'")
+pyproj = pytest.importorskip("pyproj", reason="of the extra 'sar'")
+import rasterio  # noqa: E402
+from rasterio.transform import Affine  # noqa: E402
+
+import terrafix as tf  # noqa: E402
+from terrafix.components.images.maps import ElevationMap, ReferenceMap  # noqa: E402
+from terrafix.components.truth.terrain import Terrain  # noqa: E402
+from terrafix.cosim.basics.errors import TerrafixError  # noqa: E402
+from terrafix.cosim.declare.component import Component  # noqa: E402
+from terrafix.cosim.declare.ports import Output  # noqa: E402
+from terrafix.cosim.engine.simulation import Simulation  # noqa: E402
+from terrafix.models.geometry.geodesy import geodetic  # noqa: E402
+from terrafix.models.images.reference import Reference  # noqa: E402
+from terrafix.models.maps.dem import dem_from, flat_dem  # noqa: E402
+from terrafix.models.maps.geoid import harmonic_undulation  # noqa: E402
+from terrafix.models.motion.attitude import lvlh_quaternion_array  # noqa: E402
+from terrafix.models.radar.boresight import boresight_on_terrain  # noqa: E402
+
+R_E = np.array([-1104646.3, -6096830.4, 3395727.4])  # [m], an orbit of 700 km
+V_E = np.array([-1004.7, 3648.9, 6498.0])  # [m/s]
+Q_BE = lvlh_quaternion_array(R_E, V_E)
+LOOK = np.radians(34.3)
+UTM = "EPSG:32615"
+
+
+class Pass(Component):
+    """A satellite that stands still in the air, at any distance of members from each other."""
+
+    default_rate = tf.Rate("1")
+    apart = tf.Parameter(0.0, unit="m", doc="of members")
+    r_e = Output((3,), unit="m", frame="e")
+    v_e = Output((3,), unit="m/s", frame="e")
+    q_be = Output((4,), unit="1", frame="b")
+
+    def _initialize_impl(self):
+        self.r_e = R_E + np.arange(self.n_members)[:, None] * self.apart[:, None]
+        self.v_e, self.q_be = V_E + 0 * self.r_e, np.tile(Q_BE, (self.n_members, 1))
+
+    def _step_impl(self, t, dt):
+        pass
+
+
+def beam(height=0.0):
+    """Latitude and longitude [deg], and UTM [m], of where it looks."""
+    aligned = np.array([0.0, 0.0, 0.0, 1.0])
+    found = boresight_on_terrain(R_E, V_E, Q_BE, aligned, LOOK, 0.0, flat_dem(height))
+    latitude, longitude = np.degrees(geodetic(found.point)[:2])
+    to_utm = pyproj.Transformer.from_crs(4326, 32615, always_xy=True)
+    return (latitude, longitude), to_utm.transform(longitude, latitude)
+
+
+def write(path, values, transform, crs=UTM, **options):
+    values = np.asarray(values)
+    profile = {
+        "driver": "GTiff",
+        "count": 1,
+        "height": values.shape[0],
+        "width": values.shape[1],
+        "dtype": values.dtype,
+        "crs": crs,
+        "transform": transform,
+    }
+    with rasterio.open(path, "w", **(profile | options)) as dataset:
+        dataset.write(values, 1)
+    return path
+
+
+def centered(n, spacing, angle=0.0):
+    """A turned grid of n x n whose middle lies where the beam looks."""
+    _, middle = beam()
+    return (
+        Affine.translation(*middle)
+        @ Affine.rotation(angle)
+        @ Affine.scale(spacing, -spacing)
+        @ Affine.translation(-n / 2, -n / 2)
+    )
+
+
+def system(part, members_apart=0.0, ground=None):
+    with tf.System("s", duration="1", seed=1) as built:
+        flight = built.add(Pass(apart=members_apart), "flight")
+        part = built.add(part, "part")
+        for name in ("r_e", "v_e", "q_be"):
+            built.connect(flight[name], part[name])
+        if isinstance(part, ReferenceMap):
+            ground = built.add(ground or Terrain(source="flat", flat_height=50.0), "terrain")
+            if isinstance(ground, ElevationMap):
+                for name in ("r_e", "v_e", "q_be"):
+                    built.connect(flight[name], ground[name])
+            for name in ("height", "grid"):
+                built.connect(ground[name], part[name])
+    return built
+
+
+def run(part, members=1, **options):
+    built = system(part, **options)
+    simulation = Simulation(built, members=members)
+    simulation.run_until("1")
+    return built.nodes["part"]
+
+
+def reference_map(path, **settings):
+    settings = {"look": LOOK, "reach": 2000.0} | settings
+    return ReferenceMap(map_file=path, rate=tf.Rate(times=["1"]), **settings)
+
+
+def elevation_map(path, **settings):
+    settings = {"look": LOOK, "reach": 2000.0} | settings
+    return ElevationMap(dem_file=path, rate=tf.Rate(times=["1"]), **settings)
+
+
+def failure(make, **options):
+    with pytest.raises(TerrafixError) as raised:
+        run(make(), **options)
+    return str(raised.value)
+
+
+def speckle(n):
+    return np.random.default_rng(0).rayleigh(40.0, (n, n)).astype(np.uint8) + 1
+
+
+@pytest.mark.parametrize("angle", [0.0, 45.0])
+def test_a_reference_is_the_part_of_the_map_that_the_beam_looks_at(tmp_path, angle):
+    """Its pixels lie where PROJ puts those of the map, to 0.02 of a pixel of 20 m."""
+    values, transform = speckle(900), centered(900, 20.0, angle)
+    part = run(reference_map(write(tmp_path / "m.tif", values, transform)))
+    side = part.amplitude.shape[0]
+    assert side == pytest.approx(200 * (np.sqrt(2) if angle else 1), abs=12)
+    reference = Reference(
+        part.amplitude, part.tie_rows, part.tie_columns, *np.moveaxis(part.places, -1, 0)
+    )
+    assert reference.height == pytest.approx(50.0)
+    # the map's first row and column of the part, found by its pixels
+    windows = np.lib.stride_tricks.sliding_window_view(values, (1, 40))[:, :, 0]
+    first = np.argwhere((windows == part.amplitude[0, :40]).all(axis=-1))
+    assert len(first) == 1
+    row, column = np.array([3.0, side / 2, side - 7.5]), np.array([side - 9.0, 11.5, side / 3])
+    a, b, c, d, e, f = transform[:6]
+    i, j = row + first[0, 0] + 0.5, column + first[0, 1] + 0.5
+    to_degrees = pyproj.Transformer.from_crs(32615, 4326, always_xy=True)
+    wanted = to_degrees.transform(a * j + b * i + c, d * j + e * i + f)
+    latitude, longitude, _ = reference.place(row, column)
+    meters = 6.37e6 * np.array(
+        [latitude - np.radians(wanted[1]), longitude - np.radians(wanted[0])]
+    )
+    assert np.abs(meters).max() < 0.02 * 20
+    # the beam's place is in its middle, where it meets ground 50 m high
+    (north, east), _ = beam(50.0)
+    assert reference.pixel(np.radians(north), np.radians(east))[:2] == pytest.approx(
+        [side / 2] * 2, abs=4
+    )
+
+
+def test_finer_pixels_are_averaged_and_unknown_ones_are_not_seen(tmp_path):
+    values = speckle(900)
+    values[:, 470:] = 0  # nodata, which is right of the middle
+    path = write(tmp_path / "m.tif", values, centered(900, 10.0), nodata=0)
+    part = run(reference_map(path, spacing=20.0))
+    assert part.amplitude.shape[0] == pytest.approx(200, abs=8)
+    whole = run(reference_map(path))
+    blocks = whole.amplitude[: 2 * part.amplitude.shape[0], :300].astype(float) ** 2
+    mean = np.sqrt(blocks.reshape(len(part.amplitude), 2, 150, 2).mean(axis=(1, 3)))
+    edge = int(np.flatnonzero((whole.amplitude == 0).all(axis=0))[0])
+    assert part.amplitude[:, : edge // 2] == pytest.approx(mean[:, : edge // 2], rel=1e-5)
+    assert (part.amplitude[:, edge // 2 + 1 :] == 0).all()
+
+
+def test_heights_of_a_large_model_are_read_about_the_beam(tmp_path):
+    """A plane that falls by 1 m every 100 m to the north, above the ellipsoid as is stated."""
+    _, (_, north) = beam()
+    transform = centered(900, 30.0, 10.0)
+    column, row = np.meshgrid(np.arange(900) + 0.5, np.arange(900) + 0.5)
+    y = transform[3] * column + transform[4] * row + transform[5]
+    path = write(tmp_path / "d.tif", (300 - (y - north) / 100).astype(np.float32), transform)
+    part = run(elevation_map(path, vertical_datum="ellipsoid", reach=3000.0))
+    assert max(part.height.shape) < 300
+    (latitude, longitude), _ = beam(300.0)
+    dem = dem_from(part.height, part.grid)
+    to_utm = pyproj.Transformer.from_crs(4326, 32615, always_xy=True)
+    at = np.array([longitude] * 3), latitude + np.array([-0.02, 0.0, 0.02])
+    _, y = to_utm.transform(*at)
+    found = dem.at(np.radians(at[1]), np.radians(longitude))
+    assert found == pytest.approx(300 - (y - north) / 100, abs=0.02)
+    with_both = run(
+        reference_map(write(tmp_path / "m.tif", speckle(900), centered(900, 20.0))),
+        ground=elevation_map(path, vertical_datum="ellipsoid", reach=3000.0),
+    )
+    assert np.ptp(with_both.places[..., 2]) == pytest.approx(40.0, rel=0.1)  # of 4 km
+
+
+def test_heights_above_a_geoid_are_turned_to_the_ellipsoid(tmp_path):
+    crs = UTM + "+5773"
+    path = write(tmp_path / "d.tif", np.full((900, 900), 100.0), centered(900, 30.0), crs)
+    part = run(elevation_map(path, geoid="degree 70"))
+    (latitude, longitude), _ = beam(100.0)
+    rise = harmonic_undulation(np.radians(latitude), np.radians(longitude))
+    assert np.abs(rise) > 20
+    assert np.median(part.height) == pytest.approx(100 + rise, abs=0.05)
+    text = failure(lambda: elevation_map(path, vertical_datum="ellipsoid"))
+    assert "vertical_datum is ellipsoid, but 'd.tif' says that its heights refer to EGM96" in text
+
+
+def flat_model(path, **options):
+    values = options.pop("values", np.full((900, 900), 100.0, np.float32))
+    return write(path, values, options.pop("transform", centered(900, 30.0)), **options)
+
+
+def void_about_the_middle():
+    values = np.full((900, 900), 100.0, np.float32)
+    values[300:600, 300:600] = -9999.0
+    return values
+
+
+BAD_HEIGHTS = {
+    "nothing said": ({}, {}, "does not say what its heights refer to: a geoid is up to 107 m off"),
+    "elsewhere": (
+        {"transform": Affine(30, 0, 3e5, 0, -30, 1e6)},
+        {"vertical_datum": "ellipsoid"},
+        "'part' has no heights where the beam looks: 'd.tif' does not cover latitude 29.7",
+    ),
+    "void": (
+        {"values": void_about_the_middle()},
+        {"vertical_datum": "ellipsoid"},
+        "holds nothing but voids where it is read",
+    ),
+    "of another planet": (
+        {"values": np.full((900, 900), 1e9, np.float32)},
+        {"vertical_datum": "ellipsoid"},
+        "are beyond -12000 to 9000 m, the first is 1e+09 m",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_HEIGHTS)
+def test_bad_elevation_models_get_one_error(tmp_path, case):
+    options, settings, message = BAD_HEIGHTS[case]
+    path = flat_model(tmp_path / "d.tif", **options)
+    assert message in failure(lambda: elevation_map(path, **settings))
+
+
+BAD_MAPS = {
+    "elsewhere": (
+        {"transform": Affine(20, 0, 3e5, 0, -20, 1e6)},
+        {},
+        "does not cover latitude 29.7",
+    ),
+    "empty there": ({"values": np.zeros((900, 900), np.uint8)}, {}, "knows 0 % of what is asked"),
+    "its edge": (
+        {"transform": centered(900, 20.0) @ Affine.translation(500, 0)},
+        {"reach": 6e3},
+        "knows 4",
+    ),
+    "decibels": ({"values": np.full((900, 900), -12.0)}, {}, "write 10^(dB / 20)"),
+    "too coarse": ({"transform": centered(900, 90.0)}, {}, "is too small: 96 rows"),
+    "too much": ({"transform": centered(20_000, 2.0)}, {"reach": 15e3}, "million are held at most"),
+    "of two bands": ({"count": 2}, {}, "has 2 bands"),
+    "complex": ({"values": np.ones((900, 900), np.complex64)}, {}, "name its annotation"),
+    "without a place": ({"crs": None}, {}, "has no georeference"),
+    "not there": (None, {}, "'/nowhere/m.tif' is not there"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_MAPS)
+def test_bad_maps_get_one_error(tmp_path, case):
+    options, settings, message = BAD_MAPS[case]
+    if options is None:
+        path = "/nowhere/m.tif"
+    elif case == "too much":  # sparse
+        path = tmp_path / "m.tif"
+        profile = {"driver": "GTiff", "count": 1, "height": 20_000, "width": 20_000}
+        profile |= {"dtype": np.uint8, "crs": UTM, "tiled": True, "SPARSE_OK": "TRUE"}
+        with rasterio.open(path, "w", **profile, **options):
+            pass
+    else:
+        base = {"values": speckle(900), "transform": centered(900, 20.0)}
+        path = write(tmp_path / "m.tif", **(base | options))
+    assert message in failure(lambda: reference_map(path, **settings))
+
+
+def test_a_part_is_one_for_all_members(tmp_path):
+    path = write(tmp_path / "m.tif", speckle(900), centered(900, 20.0))
+    assert run(reference_map(path), members=3).amplitude.ndim == 2
+    text = failure(lambda: reference_map(path), members=2, members_apart=5.0)
+    assert "'part.r_e' differs between members, but its output is one for all" in text
+
+
+def test_settings_that_would_do_nothing_are_refused(tmp_path):
+    path = write(tmp_path / "m.tif", speckle(900), centered(900, 20.0))
+    assert not reference_map(path).takes("first_line")
+    assert not elevation_map(path, vertical_datum="ellipsoid").takes("geoid")
+    assert elevation_map(path).takes("geoid")
+    assert not Terrain(source="jacksboro").takes("vertical_datum")
