@@ -14,8 +14,8 @@ What is wrong with it. A height that is off by :math:`\delta h` moves what is re
 the matcher takes the mean of these shifts, and what they have in common (a datum) leaves the place
 of the center right and its height wrong by :math:`\delta h`. What is left at the center itself, the
 error :math:`\delta h` of the height that is its own, lets its pixel be taken for a place that is
-:math:`\delta h / \tan\theta` too near. Map and elevation model may lie beside where they should by
-what moves places on the ground, and nothing else.
+:math:`\delta h / \tan\theta` too far and :math:`\delta h` too high: at the right range. Where map
+and elevation model lie beside where they should, so do all places.
 """
 
 from __future__ import annotations
