@@ -13,7 +13,7 @@ import numpy as np
 from terrafix.components.fields import AMPLITUDE, GRID, HEIGHT, PLACES, RADAR, SURFACE, TIES
 from terrafix.components.ground import OnGround
 from terrafix.components.sensors.aperture import MARK
-from terrafix.components.sensors.compiled import row_operations
+from terrafix.components.sensors.compiled import row_operations, speckle_of_bits
 from terrafix.components.sensors.echo import RecordedEcho
 from terrafix.components.sensors.files import (
     file_of_step,
@@ -149,7 +149,10 @@ class EarlierPass(_Reference):
                 self.n_cells,
                 beam.doppler(radar.wavelength),
             )
-            reference = earlier_pass(scene, footprint, looks, generator(self), float(snr))
+            reference = earlier_pass(
+                *(scene, footprint, looks, generator(self), float(snr)),
+                speckle=speckle_of_bits(),
+            )
         except ValueError as error:
             raise ConfigurationError(f"'{self.name}' cannot see its scene: {error}") from error
         self._publish(reference)
@@ -231,6 +234,7 @@ class EarlierFlight(_Reference, OnGround):
                 generator(self),
                 float(snr),
                 terrain=dem_from(self.known_height, self.known_grid).at,
+                speckle=speckle_of_bits(),
             )
         except ValueError as error:
             raise ConfigurationError(f"'{self.name}' cannot see its scene: {error}") from error

@@ -45,6 +45,7 @@ from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Radar, chirp_replica, un
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.history import RangeHistories, range_derivatives
 from terrafix.models.radar.scene import Scene
+from terrafix.models.radar.speckle import ARRAY_SPECKLE, Speckle, add_noise, scattered
 from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
 _TAPS = 12
@@ -110,6 +111,7 @@ def simulated_echo(
     *,
     snr_db: float = 10.0,
     operations: Rows = ARRAY_ROWS,
+    speckle: Speckle = ARRAY_SPECKLE,
 ) -> ComplexArray:
     """Raw echo of a scene: speckle, bright points, thermal noise.
 
@@ -125,6 +127,8 @@ def simulated_echo(
         Ratio of the echo of mean clutter to thermal noise [dB].
     operations : Rows
         Who turns and resamples rows; `terrafix.components.sensors.compiled` has quicker ones.
+    speckle : Speckle
+        Who makes speckle and noise; likewise.
 
     Returns
     -------
@@ -135,18 +139,22 @@ def simulated_echo(
     footprint, grid_lines = illuminated_footprint(arc, acquisition)
     terrain = TerrainGrid(footprint, scene)
     heights = _layer_heights(terrain)
-    layers = [np.zeros((footprint.n_lines, footprint.n_cells), np.complex64) for _ in range(2)]
-    _speckle(layers, terrain, heights, rng)
+    layers = scattered(terrain, heights, rng, speckle)
     _bright_points(layers, terrain, scene, heights)
     echo = received(layers, heights, footprint, acquisition, grid_lines, operations)
     aperture = acquisition.illuminated / _doppler_rate(footprint)
     noise = np.sqrt(0.5 * radar.n_pulse * aperture * radar.prf * 10 ** (-snr_db / 10))
-    _add_noise(echo, noise, rng)
+    add_noise(echo, float(noise), rng, speckle)
     return echo
 
 
 def ideal_image(
-    scene: Scene, terrain: TerrainGrid, rng: np.random.Generator, *, snr_db: float = 10.0
+    scene: Scene,
+    terrain: TerrainGrid,
+    rng: np.random.Generator,
+    *,
+    snr_db: float = 10.0,
+    speckle: Speckle = ARRAY_SPECKLE,
 ) -> ComplexArray:
     """Image of a scene as an ideal processor shows it, on the grid of a footprint.
 
@@ -161,6 +169,8 @@ def ideal_image(
         Of speckle and noise.
     snr_db : float
         Ratio of mean clutter to thermal noise [dB].
+    speckle : Speckle
+        Who makes speckle and noise; `terrafix.components.sensors.compiled` has a quicker one.
 
     Returns
     -------
@@ -168,12 +178,9 @@ def ideal_image(
     """
     footprint, radar = terrain.footprint, terrain.footprint.radar
     heights = _layer_heights(terrain)
-    layers = [np.zeros((footprint.n_lines, footprint.n_cells), np.complex64) for _ in range(2)]
-    _speckle(layers, terrain, heights, rng)
-    _bright_points(layers, terrain, scene, heights)
-    image = layers[0]
-    image += layers[1]
-    _add_noise(image, np.sqrt(0.5 * 10 ** (-snr_db / 10)), rng)
+    (image,) = scattered(terrain, heights, rng, speckle, n_layers=1)
+    _bright_points([image, image], terrain, scene, heights)
+    add_noise(image, float(np.sqrt(0.5 * 10 ** (-snr_db / 10))), rng, speckle)
     spectrum = fft.fft2(image, overwrite_x=True, workers=-1)
     f = fft.fftfreq(footprint.n_lines, 1 / radar.prf)
     f += radar.prf * np.rint((footprint.centroid - f) / radar.prf)
@@ -217,48 +224,6 @@ def _doppler_rate(footprint: Footprint) -> float:
     return float(
         2 / footprint.radar.wavelength * range_derivatives(footprint.arc, t, p[None])[0, 1]
     )
-
-
-def _complex_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> ComplexArray:
-    """Complex noise of variance 2."""
-    pairs = rng.standard_normal((*shape[:-1], 2 * shape[-1]), np.float32)
-    return pairs.view(np.complex64)
-
-
-def _add_noise(image: ComplexArray, sigma: float, rng: np.random.Generator) -> None:
-    """Add noise of a standard deviation in each of both parts, from a stream for each batch."""
-    rows = batches(len(image), 256)
-
-    def add(part: tuple[slice, np.random.Generator]) -> None:
-        noise = _complex_noise(part[1], image[part[0]].shape)
-        noise *= np.float32(sigma)
-        image[part[0]] += noise
-
-    over(zip(rows, rng.spawn(len(rows)), strict=True), add)
-
-
-def _speckle(
-    layers: list[ComplexArray],
-    terrain: TerrainGrid,
-    heights: tuple[float, float],
-    rng: np.random.Generator,
-) -> None:
-    """Add fully developed speckle: a complex normal scatterer on every pixel."""
-    rows = batches(len(layers[0]), 256)
-
-    def add(part: tuple[slice, np.random.Generator]) -> None:
-        own, stream = part
-        amplitude, share = terrain.pixels(own.start, own.stop)
-        amplitude *= np.float32(np.sqrt(0.5))
-        share -= np.float32(heights[0])
-        share /= np.float32(heights[1] - heights[0])
-        scatterers = _complex_noise(stream, amplitude.shape)
-        scatterers *= amplitude
-        layers[1][own] += share * scatterers
-        scatterers -= layers[1][own]
-        layers[0][own] += scatterers
-
-    over(zip(rows, rng.spawn(len(rows)), strict=True), add)
 
 
 def _bright_points(
