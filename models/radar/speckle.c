@@ -98,6 +98,12 @@ EXPORT void terrafix_noise(int64_t n, const uint64_t *bits, float sigma, float *
     }
 }
 
+static inline float within(float x, float last)
+{
+    const float above = x > 0.0f ? x : 0.0f;
+    return above < last ? above : last;
+}
+
 /* Values between those of two coarse lines, to coarse cells. */
 static void between_lines(
     const float *values, int64_t n_j, float line, int64_t last, float *between)
@@ -152,8 +158,8 @@ EXPORT void terrafix_scatter(
             between_cells(between + 2 * padded + start / STEP, BLOCK, db);
             between_cells(between + 3 * padded + start / STEP, BLOCK, share);
             for (int j = 0; j < BLOCK; j++) {
-                float i = fminf(fmaxf(row[j], 0.0f), (float)(n_rows - 2));
-                float k = fminf(fmaxf(column[j], 0.0f), (float)(n_columns - 2));
+                const float i = within(row[j], (float)(n_rows - 2));
+                const float k = within(column[j], (float)(n_columns - 2));
                 const int32_t whole_i = (int32_t)i, whole_k = (int32_t)k;
                 row[j] = i - (float)whole_i;
                 column[j] = k - (float)whole_k;
