@@ -128,15 +128,15 @@ static inline void between_cells(const float *coarse, int n, float *fine)
  * Scatterers of lines `first` to first + n_lines, n_cells each, in two layers.
  *
  * `coarse` (4, n_i, n_j) holds at every `line_step`-th line and STEP-th cell the row and the
- * column in `texture` (n_rows, n_columns), the brightness [dB] that is added to it, and the
+ * column in `texture` (n_rows, n_columns; rows lie row_length apart), the brightness [dB] that is added to it, and the
  * height, from which the share of the upper layer is (height - low_height) * per_height.
  * `between` is room for 4 (n_j + BLOCK). A `high` of NULL: all goes to `low`.
  */
 EXPORT void terrafix_scatter(
     int64_t first, int64_t n_lines, int64_t n_cells, int64_t line_step, int64_t n_i, int64_t n_j,
-    const float *coarse, int64_t n_rows, int64_t n_columns, const float *texture,
-    float low_height, float per_height, const uint64_t *bits, float *between, float *low,
-    float *high)
+    const float *coarse, int64_t n_rows, int64_t n_columns, int64_t row_length,
+    const float *texture, float low_height, float per_height, const uint64_t *bits,
+    float *between, float *low, float *high)
 {
     const int64_t padded = n_j + BLOCK;
     memset(between, 0, (size_t)(4 * padded) * sizeof *between);
@@ -163,12 +163,12 @@ EXPORT void terrafix_scatter(
                 const int32_t whole_i = (int32_t)i, whole_k = (int32_t)k;
                 row[j] = i - (float)whole_i;
                 column[j] = k - (float)whole_k;
-                at[j] = whole_i * (int32_t)n_columns + whole_k;
+                at[j] = whole_i * (int32_t)row_length + whole_k;
             }
             for (int j = 0; j < BLOCK; j++) {
                 const float *t = texture + at[j], u = row[j], w = column[j];
                 const float south = t[0] + w * (t[1] - t[0]);
-                const float north = t[n_columns] + w * (t[n_columns + 1] - t[n_columns]);
+                const float north = t[row_length] + w * (t[row_length + 1] - t[row_length]);
                 db[j] += south + u * (north - south);
             }
             for (int j = 0; j < n; j++) {

@@ -123,7 +123,7 @@ class CompiledSpeckle:
         self._scatter: Any = library["terrafix_scatter"]
         self._scatter.argtypes = [
             *[count] * 6,
-            *(pointer, count, count, pointer, real, real),
+            *(pointer, count, count, count, pointer, real, real),
             *[pointer] * 4,
         ]
         self._noise: Any = library["terrafix_noise"]
@@ -144,13 +144,16 @@ class CompiledSpeckle:
         n_lines, n_cells = bits.shape
         _require_whole(bits, low, *([] if high is None else [high]))
         coarse, texture = terrain.coarse, terrain.texture
+        if texture.strides[1] != texture.itemsize:
+            texture = np.ascontiguousarray(texture)
         n_i, n_j = coarse.shape[1:]
         if start < 0 or (start + n_lines - 1) > COARSE[0] * (n_i - 1) or COARSE[1] != 4:
             raise ValueError(f"lines {start} to {start + n_lines - 1} are not of the terrain")
         between = np.empty((4, n_j + _BLOCK), np.float32)
         self._scatter(
             *(start, n_lines, n_cells, COARSE[0], n_i, n_j, coarse.ctypes.data),
-            *(*texture.shape, texture.ctypes.data, heights[0], 1 / (heights[1] - heights[0])),
+            *(*texture.shape, texture.strides[0] // texture.itemsize, texture.ctypes.data),
+            *(heights[0], 1 / (heights[1] - heights[0])),
             *(bits.ctypes.data, between.ctypes.data, low.ctypes.data),
             None if high is None else high.ctypes.data,
         )
