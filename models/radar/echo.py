@@ -49,6 +49,8 @@ from terrafix.models.radar.speckle import ARRAY_SPECKLE, Speckle, add_noise, sca
 from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
 _TAPS = 12
+_SENT = 8
+"""Degree of the polynomial of range frequency that tells the phase of a line of Doppler."""
 
 
 @dataclass(frozen=True)
@@ -339,32 +341,37 @@ def received(
     by_range = chebyshev.chebvander(_scaled_to(ranges, middle.span), 4).T
     scale = 2 / radar.wavelength
 
-    def compress_inversely(rows: slice) -> None:
+    pulse = fft.fft(chirp_replica(radar), n_cells).astype(np.complex64) * unit_phasor(-0.125)
+    stretch, origin = _migration(radar.wavelength * frequency, middle, ranges)
+    by_cell = chebyshev.chebvander(fft.fftfreq(n_cells, 0.5), _SENT).T
+    nodes = radar.sample_rate / 2 * chebyshev.chebpts1(_SENT + 1)
+    to_coefficients = np.linalg.inv(chebyshev.chebvander(chebyshev.chebpts1(_SENT + 1), _SENT)).T
+
+    def compress_inversely(rows: slice) -> ComplexArray:
         x = middle.clipped(radar.wavelength * frequency[rows])
         low, high = (spectrum[rows] for spectrum in spectra)
         for part, history in ((low, histories[0]), (high, histories[1])):
-            operations.turn_by(part, scale * (history.at(x) @ by_range))
+            operations.turn_by(part, (scale * history.at(x)) @ by_range)
         low += high
         low *= (weight[rows] * lit[rows]).astype(np.float32)[:, None]
-        total[rows] = low
+        return low
 
-    over([rows for rows in batches(n_lines) if lit[rows].any()], compress_inversely)
-    spectra.clear()
-    _migrate(total, radar.wavelength * frequency, lit, middle, ranges, operations)
-    total = fft.fft(total, axis=1, overwrite_x=True, workers=-1)
-    pulse = fft.fft(chirp_replica(radar), n_cells).astype(np.complex64) * unit_phasor(-0.125)
-    f_r = fft.fftfreq(n_cells, 1 / radar.sample_rate)
-
-    def send(rows: slice) -> None:
+    def send(spectrum: ComplexArray, rows: slice) -> None:
         f = np.where(lit[rows], frequency[rows], acquisition.centroid)[:, None]
-        own = scale * middle.middle(radar.wavelength * f)
-        cycles = 2 * (radar.carrier + f_r) / SPEED_OF_LIGHT
-        cycles = cycles * middle.middle(SPEED_OF_LIGHT * f / (radar.carrier + f_r)) - own
-        operations.turn_by(total[rows], cycles)
-        total[rows] *= pulse
+        carrier = radar.carrier + nodes
+        cycles = 2 * carrier / SPEED_OF_LIGHT * middle.middle(SPEED_OF_LIGHT * f / carrier)
+        cycles -= scale * middle.middle(radar.wavelength * f)
+        operations.turn_by(spectrum, cycles @ to_coefficients @ by_cell)
+        spectrum *= pulse
 
-    over([rows for rows in batches(n_lines) if lit[rows].any()], send)
-    total = fft.ifft(total, axis=1, overwrite_x=True, workers=-1)
+    def receive(rows: slice) -> None:
+        # ranges other than the middle one move by what their migration differs from its
+        part = operations.stretched(compress_inversely(rows), origin, -stretch[rows])
+        part = fft.fft(part, axis=1, overwrite_x=True)
+        send(part, rows)
+        total[rows] = fft.ifft(part, axis=1, overwrite_x=True)
+
+    over([rows for rows in batches(n_lines) if lit[rows].any()], receive)
     total = fft.ifft(total, axis=0, overwrite_x=True, workers=-1)
     shift = round((acquisition.near_range - footprint.near_range) / radar.range_spacing)
     part = total[first_line : first_line + acquisition.n_lines, shift : shift + acquisition.n_cells]
@@ -375,21 +382,12 @@ def _scaled_to(x: FloatArray, span: FloatArray) -> FloatArray:
     return (x - np.mean(span)) / (np.ptp(span) / 2)
 
 
-def _migrate(
-    spectrum: ComplexArray,
-    x: FloatArray,
-    lit: FloatArray,
-    history: RangeHistories,
-    ranges: FloatArray,
-    operations: Rows,
-) -> None:
-    """Move ranges other than the middle one by what their migration differs from its."""
+def _migration(
+    x: FloatArray, history: RangeHistories, ranges: FloatArray
+) -> tuple[FloatArray, float]:
+    """How much more than the middle range others migrate, in cells per cell; and that cell."""
     x = history.clipped(x)
     ends = [-g(x) + x * g.deriv()(x) for g in (history.g[0], history.g[-1])]
     stretch = (ends[1] - ends[0]) / (history.ranges[-1] - history.ranges[0])
     origin = float((np.mean(history.span) - ranges[0]) / (ranges[1] - ranges[0]))
-
-    def move(rows: slice) -> None:
-        spectrum[rows] = operations.stretched(spectrum[rows], origin, -stretch[rows])
-
-    over([rows for rows in batches(len(spectrum), 256) if lit[rows].any()], move)
+    return np.asarray(stretch), origin
