@@ -12,6 +12,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
 from terrafix.models.core.arrays import FloatArray, Single
+from terrafix.models.core.parallel import batches, over
 from terrafix.models.geometry.ground import EllipsoidGround, Ground
 from terrafix.models.motion.arc import seen_at
 from terrafix.models.motion.sampled import Arc
@@ -121,8 +122,14 @@ class TerrainGrid:
         t: FloatArray = np.asarray(footprint.first_time + lines / radar.prf, np.float64)
         R: FloatArray = np.asarray(footprint.near_range + cells * radar.range_spacing, np.float64)
         surface = _Surface(footprint, t[[0, -1]], R[[0, -1]], scene)
-        self.latitude, self.longitude, self.height = surface.on(t, R)
-        self.power_db = self._power_db(scene, t)
+        self.latitude, self.longitude, self.height, self.power_db = np.empty((4, n_i, n_j))
+
+        def look_up(rows: slice) -> None:
+            own = surface.on(t[rows], R)
+            self.latitude[rows], self.longitude[rows], self.height[rows] = own
+            self.power_db[rows] = self._power_db(scene, t[rows], *own)
+
+        over(batches(n_i), look_up)
         self._i, self._j = self.latitude / scene.cell, self.longitude / scene.cell
         self.cells = tuple(
             range(int(np.floor(a.min())) - 1, int(np.ceil(a.max())) + 2) for a in (self._i, self._j)
@@ -157,12 +164,19 @@ class TerrainGrid:
         fine = cv2.warpAffine(coarse, places, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(fine)
 
-    def _power_db(self, scene: Scene, t: FloatArray) -> FloatArray:
-        p = self.footprint.ground.point(self.latitude, self.longitude, self.height)
+    def _power_db(
+        self,
+        scene: Scene,
+        t: FloatArray,
+        latitude: FloatArray,
+        longitude: FloatArray,
+        height: FloatArray,
+    ) -> FloatArray:
+        p = self.footprint.ground.point(latitude, longitude, height)
         line = self.footprint.arc.position(t)[:, None, :] - p
         line /= np.linalg.norm(line, axis=-1, keepdims=True)
         north, east, down = np.moveaxis(self.footprint.ground.axes(p), -2, 0)
-        slope_north, slope_east = scene.dem.slopes(self.latitude, self.longitude)
+        slope_north, slope_east = scene.dem.slopes(latitude, longitude)
         normal = -down - slope_north[..., None] * north - slope_east[..., None] * east
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         power = brightness(np.sum(line * normal, axis=-1))
