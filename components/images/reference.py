@@ -13,7 +13,7 @@ import numpy as np
 from terrafix.components.fields import AMPLITUDE, GRID, HEIGHT, PLACES, RADAR, SURFACE, TIES
 from terrafix.components.ground import OnGround
 from terrafix.components.sensors.aperture import MARK
-from terrafix.components.sensors.compiled import row_operations
+from terrafix.components.sensors.compiled import row_operations, speckle_of_bits
 from terrafix.components.sensors.echo import RecordedEcho
 from terrafix.components.sensors.files import (
     file_of_step,
@@ -160,7 +160,9 @@ class EarlierPass(ReferenceSource):
     def _seen(
         self, scene: Scene, footprint: Footprint, looks: tuple[int, int], snr_db: float
     ) -> Reference:
-        return earlier_pass(scene, footprint, looks, generator(self), snr_db)
+        return earlier_pass(
+            *(scene, footprint, looks, generator(self), snr_db), speckle=speckle_of_bits()
+        )
 
 
 class RenderedReference(EarlierPass):
@@ -283,6 +285,7 @@ class EarlierFlight(ReferenceSource, OnGround):
                 generator(self),
                 float(snr),
                 terrain=dem_from(self.known_height, self.known_grid).at,
+                speckle=speckle_of_bits(),
             )
         except ValueError as error:
             raise ConfigurationError(f"'{self.name}' cannot see its scene: {error}") from error

@@ -7,7 +7,7 @@ import warnings
 from functools import cache
 
 from terrafix.cosim.kernels import toolchain
-from terrafix.models.radar import pulses, spectra
+from terrafix.models.radar import pulses, speckle, spectra
 
 
 @cache
@@ -28,6 +28,13 @@ def row_operations() -> spectra.Rows:
     """Operations on rows of spectra, likewise."""
     library = _library(spectra.c_source(), "images are formed with NumPy, two")
     return spectra.CompiledRows(library) if library else spectra.ARRAY_ROWS
+
+
+@cache
+def speckle_of_bits() -> speckle.Speckle:
+    """Speckle and noise of random bits, likewise."""
+    library = _library(speckle.c_source(), "speckle is made with NumPy, five")
+    return speckle.CompiledSpeckle(library) if library else speckle.ARRAY_SPECKLE
 
 
 def _library(source: str, otherwise: str) -> ctypes.CDLL | None:

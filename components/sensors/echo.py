@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.components.fields import ACQUISITION, ECHO, GRID, HEIGHT, RADAR, SURFACE
-from terrafix.components.sensors.compiled import row_operations
+from terrafix.components.sensors.compiled import row_operations, speckle_of_bits
 from terrafix.components.sensors.files import (
     file_of_step,
     near_range,
@@ -197,6 +197,7 @@ class SceneEcho(_Echo):
                 *(scene, arc, acquisition, generator(self)),
                 snr_db=snr,
                 operations=row_operations(),
+                speckle=speckle_of_bits(),
             )
         except ValueError as error:
             raise ConfigurationError(f"'{self.name}' cannot simulate its echo: {error}") from error

@@ -24,6 +24,7 @@ from terrafix.models.radar.focusing import Image
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.multilook import detected, full_index, multilook_index
 from terrafix.models.radar.scene import Scene
+from terrafix.models.radar.speckle import ARRAY_SPECKLE, Speckle
 
 _ROUNDS, _CLOSE = 20, 1e-3
 """Of the search for a place's pixel, and how close it comes [pixels]; of heights [m]."""
@@ -298,6 +299,7 @@ def earlier_pass(
     snr_db: float = 10.0,
     *,
     terrain: Height | None = None,
+    speckle: Speckle = ARRAY_SPECKLE,
 ) -> Reference:
     """Reference as an ideal processor makes it of an earlier pass, with speckle of its own.
 
@@ -315,9 +317,11 @@ def earlier_pass(
     terrain : callable, optional
         Height [m] at latitudes and longitudes [rad] that who made the reference took for true; the
         scene's own by default.
+    speckle : Speckle
+        Who makes speckle and noise; `terrafix.components.sensors.compiled` has a quicker one.
     """
     grid = TerrainGrid(footprint, scene)
-    amplitude = detected(ideal_image(scene, grid, rng, snr_db=snr_db), looks)
+    amplitude = detected(ideal_image(scene, grid, rng, snr_db=snr_db, speckle=speckle), looks)
     rows, columns = (multilook_index(a, n) for a, n in zip(grid.ties, looks, strict=True))
     if terrain is None:
         return Reference(amplitude, rows, columns, grid.latitude, grid.longitude, grid.height)

@@ -45,9 +45,12 @@ from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Radar, chirp_replica, un
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.history import RangeHistories, range_derivatives
 from terrafix.models.radar.scene import Scene
+from terrafix.models.radar.speckle import ARRAY_SPECKLE, Speckle, add_noise, scattered
 from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
 _TAPS = 12
+_SENT = 8
+"""Degree of the polynomial of range frequency that tells the phase of a line of Doppler."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,7 @@ def simulated_echo(
     *,
     snr_db: float = 10.0,
     operations: Rows = ARRAY_ROWS,
+    speckle: Speckle = ARRAY_SPECKLE,
 ) -> ComplexArray:
     """Raw echo of a scene: speckle, bright points, thermal noise.
 
@@ -128,6 +132,8 @@ def simulated_echo(
         Ratio of the echo of mean clutter to thermal noise [dB].
     operations : Rows
         Who turns and resamples rows; `terrafix.components.sensors.compiled` has quicker ones.
+    speckle : Speckle
+        Who makes speckle and noise; likewise.
 
     Returns
     -------
@@ -138,18 +144,22 @@ def simulated_echo(
     footprint, grid_lines = illuminated_footprint(arc, acquisition)
     terrain = TerrainGrid(footprint, scene)
     heights = _layer_heights(terrain)
-    layers = [np.zeros((footprint.n_lines, footprint.n_cells), np.complex64) for _ in range(2)]
-    _speckle(layers, terrain, heights, rng)
+    layers = scattered(terrain, heights, rng, speckle)
     _bright_points(layers, terrain, scene, heights)
     echo = received(layers, heights, footprint, acquisition, grid_lines, operations)
     aperture = acquisition.illuminated / _doppler_rate(footprint)
     noise = np.sqrt(0.5 * radar.n_pulse * aperture * radar.prf * 10 ** (-snr_db / 10))
-    _add_noise(echo, noise, rng)
+    add_noise(echo, float(noise), rng, speckle)
     return echo
 
 
 def ideal_image(
-    scene: Scene, terrain: TerrainGrid, rng: np.random.Generator, *, snr_db: float = 10.0
+    scene: Scene,
+    terrain: TerrainGrid,
+    rng: np.random.Generator,
+    *,
+    snr_db: float = 10.0,
+    speckle: Speckle = ARRAY_SPECKLE,
 ) -> ComplexArray:
     """Image of a scene as an ideal processor shows it, on the grid of a footprint.
 
@@ -164,6 +174,8 @@ def ideal_image(
         Of speckle and noise.
     snr_db : float
         Ratio of mean clutter to thermal noise [dB].
+    speckle : Speckle
+        Who makes speckle and noise; `terrafix.components.sensors.compiled` has a quicker one.
 
     Returns
     -------
@@ -171,12 +183,9 @@ def ideal_image(
     """
     footprint, radar = terrain.footprint, terrain.footprint.radar
     heights = _layer_heights(terrain)
-    layers = [np.zeros((footprint.n_lines, footprint.n_cells), np.complex64) for _ in range(2)]
-    _speckle(layers, terrain, heights, rng)
-    _bright_points(layers, terrain, scene, heights)
-    image = layers[0]
-    image += layers[1]
-    _add_noise(image, np.sqrt(0.5 * 10 ** (-snr_db / 10)), rng)
+    (image,) = scattered(terrain, heights, rng, speckle, n_layers=1)
+    _bright_points([image, image], terrain, scene, heights)
+    add_noise(image, float(np.sqrt(0.5 * 10 ** (-snr_db / 10))), rng, speckle)
     spectrum = fft.fft2(image, overwrite_x=True, workers=-1)
     f = fft.fftfreq(footprint.n_lines, 1 / radar.prf)
     f += radar.prf * np.rint((footprint.centroid - f) / radar.prf)
@@ -222,48 +231,6 @@ def _doppler_rate(footprint: Footprint) -> float:
     return float(
         2 / footprint.radar.wavelength * range_derivatives(footprint.arc, t, p[None])[0, 1]
     )
-
-
-def _complex_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> ComplexArray:
-    """Complex noise of variance 2."""
-    pairs = rng.standard_normal((*shape[:-1], 2 * shape[-1]), np.float32)
-    return pairs.view(np.complex64)
-
-
-def _add_noise(image: ComplexArray, sigma: float, rng: np.random.Generator) -> None:
-    """Add noise of a standard deviation in each of both parts, from a stream for each batch."""
-    rows = batches(len(image), 256)
-
-    def add(part: tuple[slice, np.random.Generator]) -> None:
-        noise = _complex_noise(part[1], image[part[0]].shape)
-        noise *= np.float32(sigma)
-        image[part[0]] += noise
-
-    over(zip(rows, rng.spawn(len(rows)), strict=True), add)
-
-
-def _speckle(
-    layers: list[ComplexArray],
-    terrain: TerrainGrid,
-    heights: tuple[float, float],
-    rng: np.random.Generator,
-) -> None:
-    """Add fully developed speckle: a complex normal scatterer on every pixel."""
-    rows = batches(len(layers[0]), 256)
-
-    def add(part: tuple[slice, np.random.Generator]) -> None:
-        own, stream = part
-        amplitude, share = terrain.pixels(own.start, own.stop)
-        amplitude *= np.float32(np.sqrt(0.5))
-        share -= np.float32(heights[0])
-        share /= np.float32(heights[1] - heights[0])
-        scatterers = _complex_noise(stream, amplitude.shape)
-        scatterers *= amplitude
-        layers[1][own] += share * scatterers
-        scatterers -= layers[1][own]
-        layers[0][own] += scatterers
-
-    over(zip(rows, rng.spawn(len(rows)), strict=True), add)
 
 
 def _bright_points(
@@ -379,32 +346,37 @@ def received(
     by_range = chebyshev.chebvander(_scaled_to(ranges, middle.span), 4).T
     scale = 2 / radar.wavelength
 
-    def compress_inversely(rows: slice) -> None:
+    pulse = fft.fft(chirp_replica(radar), n_cells).astype(np.complex64) * unit_phasor(-0.125)
+    stretch, origin = _migration(radar.wavelength * frequency, middle, ranges)
+    by_cell = chebyshev.chebvander(fft.fftfreq(n_cells, 0.5), _SENT).T
+    nodes = radar.sample_rate / 2 * chebyshev.chebpts1(_SENT + 1)
+    to_coefficients = np.linalg.inv(chebyshev.chebvander(chebyshev.chebpts1(_SENT + 1), _SENT)).T
+
+    def compress_inversely(rows: slice) -> ComplexArray:
         x = middle.clipped(radar.wavelength * frequency[rows])
         low, high = (spectrum[rows] for spectrum in spectra)
         for part, history in ((low, histories[0]), (high, histories[1])):
-            operations.turn_by(part, scale * (history.at(x) @ by_range))
+            operations.turn_by(part, (scale * history.at(x)) @ by_range)
         low += high
         low *= (weight[rows] * lit[rows]).astype(np.float32)[:, None]
-        total[rows] = low
+        return low
 
-    over([rows for rows in batches(n_lines) if lit[rows].any()], compress_inversely)
-    spectra.clear()
-    _migrate(total, radar.wavelength * frequency, lit, middle, ranges, operations)
-    total = fft.fft(total, axis=1, overwrite_x=True, workers=-1)
-    pulse = fft.fft(chirp_replica(radar), n_cells).astype(np.complex64) * unit_phasor(-0.125)
-    f_r = fft.fftfreq(n_cells, 1 / radar.sample_rate)
-
-    def send(rows: slice) -> None:
+    def send(spectrum: ComplexArray, rows: slice) -> None:
         f = np.where(lit[rows], frequency[rows], acquisition.centroid)[:, None]
-        own = scale * middle.middle(radar.wavelength * f)
-        cycles = 2 * (radar.carrier + f_r) / SPEED_OF_LIGHT
-        cycles = cycles * middle.middle(SPEED_OF_LIGHT * f / (radar.carrier + f_r)) - own
-        operations.turn_by(total[rows], cycles)
-        total[rows] *= pulse
+        carrier = radar.carrier + nodes
+        cycles = 2 * carrier / SPEED_OF_LIGHT * middle.middle(SPEED_OF_LIGHT * f / carrier)
+        cycles -= scale * middle.middle(radar.wavelength * f)
+        operations.turn_by(spectrum, cycles @ to_coefficients @ by_cell)
+        spectrum *= pulse
 
-    over([rows for rows in batches(n_lines) if lit[rows].any()], send)
-    total = fft.ifft(total, axis=1, overwrite_x=True, workers=-1)
+    def receive(rows: slice) -> None:
+        # ranges other than the middle one move by what their migration differs from its
+        part = operations.stretched(compress_inversely(rows), origin, -stretch[rows])
+        part = fft.fft(part, axis=1, overwrite_x=True)
+        send(part, rows)
+        total[rows] = fft.ifft(part, axis=1, overwrite_x=True)
+
+    over([rows for rows in batches(n_lines) if lit[rows].any()], receive)
     total = fft.ifft(total, axis=0, overwrite_x=True, workers=-1)
     shift = round((acquisition.near_range - footprint.near_range) / radar.range_spacing)
     part = total[first_line : first_line + acquisition.n_lines, shift : shift + acquisition.n_cells]
@@ -415,21 +387,12 @@ def _scaled_to(x: FloatArray, span: FloatArray) -> FloatArray:
     return (x - np.mean(span)) / (np.ptp(span) / 2)
 
 
-def _migrate(
-    spectrum: ComplexArray,
-    x: FloatArray,
-    lit: FloatArray,
-    history: RangeHistories,
-    ranges: FloatArray,
-    operations: Rows,
-) -> None:
-    """Move ranges other than the middle one by what their migration differs from its."""
+def _migration(
+    x: FloatArray, history: RangeHistories, ranges: FloatArray
+) -> tuple[FloatArray, float]:
+    """How much more than the middle range others migrate, in cells per cell; and that cell."""
     x = history.clipped(x)
     ends = [-g(x) + x * g.deriv()(x) for g in (history.g[0], history.g[-1])]
     stretch = (ends[1] - ends[0]) / (history.ranges[-1] - history.ranges[0])
     origin = float((np.mean(history.span) - ranges[0]) / (ranges[1] - ranges[0]))
-
-    def move(rows: slice) -> None:
-        spectrum[rows] = operations.stretched(spectrum[rows], origin, -stretch[rows])
-
-    over([rows for rows in batches(len(spectrum), 256) if lit[rows].any()], move)
+    return np.asarray(stretch), origin

@@ -12,15 +12,15 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
 from terrafix.models.core.arrays import FloatArray, Single
+from terrafix.models.core.parallel import batches, over
 from terrafix.models.geometry.ground import EllipsoidGround, Ground
 from terrafix.models.motion.arc import seen_at
 from terrafix.models.motion.sampled import Arc
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.scene import Scene, brightness
 
-_COARSE = (16, 4)
+COARSE = (16, 4)
 """Lines and cells between the points at which terrain is looked up."""
-
 
 _CLOSE = 0.05
 """How well the height of the terrain must agree with where it is looked up [m]."""
@@ -107,48 +107,58 @@ class TerrainGrid:
         Of the points seen at lines ``16 i`` and cells ``4 j``, [rad] and [m].
     power_db : ndarray, shape (n_i, n_j)
         Brightness of the terrain there, without texture [dB].
+    coarse : ndarray of float32, shape (4, n_i, n_j)
+        Row and column of the texture there, brightness and height.
+    texture : ndarray of float32
+        Texture of the cells [dB].
     """
 
     def __init__(self, footprint: Footprint, scene: Scene) -> None:
         self.footprint = footprint
         n_i, n_j = (
             -(-(n - 1) // s) + 1
-            for n, s in zip((footprint.n_lines, footprint.n_cells), _COARSE, strict=True)
+            for n, s in zip((footprint.n_lines, footprint.n_cells), COARSE, strict=True)
         )
         radar = footprint.radar
-        lines, cells = _COARSE[0] * np.arange(n_i), _COARSE[1] * np.arange(n_j)
+        lines, cells = COARSE[0] * np.arange(n_i), COARSE[1] * np.arange(n_j)
         t: FloatArray = np.asarray(footprint.first_time + lines / radar.prf, np.float64)
         R: FloatArray = np.asarray(footprint.near_range + cells * radar.range_spacing, np.float64)
         surface = _Surface(footprint, t[[0, -1]], R[[0, -1]], scene)
-        self.latitude, self.longitude, self.height = surface.on(t, R)
-        self.power_db = self._power_db(scene, t)
+        self.latitude, self.longitude, self.height, self.power_db = np.empty((4, n_i, n_j))
+
+        def look_up(rows: slice) -> None:
+            own = surface.on(t[rows], R)
+            self.latitude[rows], self.longitude[rows], self.height[rows] = own
+            self.power_db[rows] = self._power_db(scene, t[rows], *own)
+
+        over(batches(n_i), look_up)
         self._i, self._j = self.latitude / scene.cell, self.longitude / scene.cell
         self.cells = tuple(
             range(int(np.floor(a.min())) - 1, int(np.ceil(a.max())) + 2) for a in (self._i, self._j)
         )
-        self._texture = scene.texture(*self.cells)
+        self.texture = scene.texture(*self.cells)
         inside = [a - own.start for a, own in zip((self._i, self._j), self.cells, strict=True)]
-        self._coarse = [a.astype(np.float32) for a in (*inside, self.power_db, self.height)]
+        self.coarse = np.array([*inside, self.power_db, self.height], np.float32)
 
     @property
     def ties(self) -> tuple[FloatArray, FloatArray]:
         """Lines and cells of the footprint at which the arrays above hold."""
         n_i, n_j = self.latitude.shape
-        return _COARSE[0] * np.arange(n_i, dtype=float), _COARSE[1] * np.arange(n_j, dtype=float)
+        return COARSE[0] * np.arange(n_i, dtype=float), COARSE[1] * np.arange(n_j, dtype=float)
 
     def pixels(self, start: int, stop: int) -> tuple[Single, Single]:
         """Mean amplitude and terrain height [m] of every pixel of some lines, (stop - start, n).
 
         Without bright points and speckle.
         """
-        i, j, db, height = (self._interpolated(a, start, stop) for a in self._coarse)
-        db += cv2.remap(self._texture, j, i, cv2.INTER_LINEAR)
+        i, j, db, height = (self._interpolated(a, start, stop) for a in self.coarse)
+        db += cv2.remap(self.texture, j, i, cv2.INTER_LINEAR)
         db *= np.float32(np.log(10) / 20)
         return np.exp(db, out=db), height
 
     def _interpolated(self, coarse: Single, start: int, stop: int) -> Single:
         """Linear interpolation of coarse values to all cells of some lines."""
-        by_line, by_cell = (1 / step for step in _COARSE)
+        by_line, by_cell = (1 / step for step in COARSE)
         places = np.array([[by_cell, 0.0, 0.0], [0.0, by_line, start * by_line]])
         # places are multiples of a 16th, which OpenCV's fixed point holds exactly
         size = (self.footprint.n_cells, stop - start)
@@ -156,12 +166,19 @@ class TerrainGrid:
         fine = cv2.warpAffine(coarse, places, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(fine)
 
-    def _power_db(self, scene: Scene, t: FloatArray) -> FloatArray:
-        p = self.footprint.ground.point(self.latitude, self.longitude, self.height)
+    def _power_db(
+        self,
+        scene: Scene,
+        t: FloatArray,
+        latitude: FloatArray,
+        longitude: FloatArray,
+        height: FloatArray,
+    ) -> FloatArray:
+        p = self.footprint.ground.point(latitude, longitude, height)
         line = self.footprint.arc.position(t)[:, None, :] - p
         line /= np.linalg.norm(line, axis=-1, keepdims=True)
         north, east, down = np.moveaxis(self.footprint.ground.axes(p), -2, 0)
-        slope_north, slope_east = scene.dem.slopes(self.latitude, self.longitude)
+        slope_north, slope_east = scene.dem.slopes(latitude, longitude)
         normal = -down - slope_north[..., None] * north - slope_east[..., None] * east
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         power = brightness(np.sum(line * normal, axis=-1))

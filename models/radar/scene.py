@@ -172,7 +172,11 @@ class Scene:
             own = range(rows.start + part.start, rows.start + part.stop)
             for name, scale, values in coarse:
                 field = _enlarged(values, ci, cj, own, columns)
-                fine[part] += np.float32(scale) * (np.sign(field) if name != "smooth" else field)
+                if name == "smooth":
+                    field *= np.float32(scale)
+                else:
+                    np.copysign(np.float32(scale), field, out=field)
+                fine[part] += field
 
         over(batches(len(rows), 256), add)
         return fine
@@ -372,14 +376,18 @@ def _generator(seed: int, name: str, *block: int) -> np.random.Generator:
 
 
 def _smoothed_noise(seed: int, name: str, rows: range, columns: range, sigma: float) -> Single:
-    """White noise of every cell, smoothed by a Gaussian of `sigma` cells, of unit variance."""
+    """White noise of every cell, smoothed by a Gaussian of `sigma` cells, of unit variance.
+
+    It is uniform and in whole bytes; the mean of a dozen of them or more is all but normal.
+    """
     m = int(np.ceil(4 * sigma))
     wide = [range(r.start - m, r.stop + m) for r in (rows, columns)]
-    out = np.empty((len(wide[0]), len(wide[1])), np.float32)
+    out = np.empty((len(wide[0]), len(wide[1])), np.uint8)
 
     def fill(bi: int) -> None:
         for bj in range(wide[1].start // _BLOCK, -(-wide[1].stop // _BLOCK)):
-            block = _generator(seed, name, bi, bj).standard_normal((_BLOCK, _BLOCK), np.float32)
+            drawn = _generator(seed, name, bi, bj).bytes(_BLOCK * _BLOCK)
+            block = np.frombuffer(drawn, np.uint8).reshape(_BLOCK, _BLOCK)
             (i0, i1), (j0, j1) = (
                 (max(b * _BLOCK, w.start), min((b + 1) * _BLOCK, w.stop))
                 for b, w in zip((bi, bj), wide, strict=True)
@@ -392,16 +400,35 @@ def _smoothed_noise(seed: int, name: str, rows: range, columns: range, sigma: fl
     over(range(wide[0].start // _BLOCK, -(-wide[0].stop // _BLOCK)), fill)
     kernel = cv2.getGaussianKernel(2 * m + 1, sigma, cv2.CV_64F)
     smooth = cv2.sepFilter2D(out, cv2.CV_32F, kernel, kernel)[m:-m, m:-m]
-    return np.asarray(smooth / np.float32(np.sum(kernel**2)))
+    smooth -= np.float32(127.5)
+    smooth *= np.float32(1 / (np.sqrt((256**2 - 1) / 12) * np.sum(kernel**2)))
+    return np.asarray(smooth)
+
+
+def _cubic_weights() -> Single:
+    """Weights (_COARSE, 4) of the four coarse cells about each cell of one."""
+    x = np.abs(np.arange(_COARSE)[:, None] / _COARSE - np.arange(-1, 3))
+    a = -0.75  # of Keys' kernel, as OpenCV has it
+    near = ((a + 2) * x - (a + 3)) * x * x + 1
+    far = ((a * x - 5 * a) * x + 8 * a) * x - 4 * a
+    return np.where(x <= 1, near, far).astype(np.float32)
+
+
+_WEIGHTS = _cubic_weights()
 
 
 def _enlarged(coarse: Single, ci: range, cj: range, rows: range, columns: range) -> Single:
     """Cubic interpolation of values at every `_COARSE`-th cell to a rectangle of cells."""
-    i = (np.arange(rows.start, rows.stop, dtype=np.float32) / _COARSE - ci.start)[:, None]
-    j = (np.arange(columns.start, columns.stop, dtype=np.float32) / _COARSE - cj.start)[None, :]
-    maps = (
-        np.broadcast_to(j, (len(rows), len(columns))),
-        np.broadcast_to(i, (len(rows), len(columns))),
-    )
-    x, y = (np.ascontiguousarray(m) for m in maps)
-    return np.asarray(cv2.remap(coarse, x, y, cv2.INTER_CUBIC))
+    wide, first = _lengthened(np.ascontiguousarray(coarse.T), cj, columns)
+    long, top = _lengthened(np.ascontiguousarray(wide[first : first + len(columns)].T), ci, rows)
+    return long[top : top + len(rows)]
+
+
+def _lengthened(coarse: Single, knots: range, rows: range) -> tuple[Single, int]:
+    """Cubic interpolation between coarse rows to the cells of a range, and which is its first."""
+    start, stop = rows.start // _COARSE, (rows.stop - 1) // _COARSE + 1
+    out = np.empty((stop - start, _COARSE, coarse.shape[1]), np.float32)
+    for k in range(start, stop):
+        at = k - 1 - knots.start
+        np.matmul(_WEIGHTS, coarse[at : at + 4], out=out[k - start])
+    return out.reshape(-1, coarse.shape[1]), rows.start - start * _COARSE

@@ -179,11 +179,13 @@ def test_the_same_place_looks_the_same_from_wherever_it_is_asked():
 
 
 def test_texture_has_the_strength_asked_for():
+    """The mean within four standard errors of a Gaussian's width of independent cells."""
     rows, columns = range(3000), range(3000)
-    for name in ("parcels_db", "smooth_db", "fine_db"):
+    for name, width in (("parcels_db", 32), ("smooth_db", 96), ("fine_db", 1)):
         texture = Scene(flat_dem(), **PLAIN | {name: 2.0}).texture(rows, columns)
         assert texture.std() == pytest.approx(2.0, rel=0.12)  # smooth: some hundred cells
-        assert texture.mean() == pytest.approx(0.0, abs=0.3)
+        error = 2.0 * np.sqrt(4 * np.pi) * width / 3000
+        assert texture.mean() == pytest.approx(0.0, abs=4 * error + 1e-3)
 
 
 def test_points_have_the_density_asked_for():
