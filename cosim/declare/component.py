@@ -327,7 +327,7 @@ class Component(Shown):
         return f"'{self.name}' does not take '{name}'{with_these}: it would change nothing"
 
     def alone(self) -> bool:
-        """Whether what it shares is of one member, as it is set: members are flown one at a time."""
+        """Whether what it shares is of one member, as it is set: members fly one at a time."""
         return False
 
     def missing_settings(self) -> list[str]:
