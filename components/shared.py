@@ -7,7 +7,19 @@ import numpy as np
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.parameters import Parameter
+from terrafix.cosim.declare.parameters import Flag, Parameter
+
+
+class OwnOrCommon(Component):
+    """Base of components whose shared output is one for all members, or each member's own."""
+
+    own = Flag(
+        False, doc="each member's own, with noise of its own: members are flown one at a time"
+    )
+
+    def alone(self) -> bool:
+        """Whether it is each member's own."""
+        return bool(self.setting("own"))
 
 
 def common(component: Component, name: str) -> FloatArray:
@@ -18,16 +30,24 @@ def common(component: Component, name: str) -> FloatArray:
         raise ConfigurationError(
             f"'{component.name}.{name}' differs between members, but its output is one for all\n"
             "  fly members with one truth: disperse what is known at the start and the sensors, "
-            "not the orbit, the attitude or the antenna; or fly one member at a time"
+            f"not the orbit, the attitude or the antenna; or {_one_at_a_time(component)}"
         )
     return np.asarray(values[0])
+
+
+def _one_at_a_time(component: Component) -> str:
+    if "own" in component.settings():
+        return f"fly one member at a time: terrafix campaign, with {component.name}.own = true"
+    return "fly one member at a time"
 
 
 def generator(component: Component, member: int | None = None) -> np.random.Generator:
     """Noise of a step: of the root seed, the component and its step alone, and of a member.
 
-    One for all members if none is named; a member is one of those flown here, by its place.
+    One for all members if none is named, unless the component is of one alone; a member is one of
+    those flown here, by its place.
     """
+    member = 0 if member is None and component.alone() else member
     env = component.environment
     words = [env.seed & 0xFFFFFFFF, env.seed >> 32, component.step_index, *env.path.encode()]
     if member is not None:
@@ -51,7 +71,7 @@ def require_common(component: Component, *names: str) -> None:
             raise ConfigurationError(
                 f"'{component.name}.{name}' differs between members, but what "
                 f"'{component.name}' makes with it is one for all\n"
-                "  leave it out of the dispersions, or fly one member at a time"
+                f"  leave it out of the dispersions, or {_one_at_a_time(component)}"
             )
 
 

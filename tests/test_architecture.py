@@ -60,10 +60,16 @@ def names(values):
     return [f"{layer}/{path.name}" for layer, path in values]
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
 def imported(path: Path) -> set[str]:
     """Every module named in an import statement, at whatever depth."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -131,7 +137,7 @@ FOREIGN = {
 @cache
 def touched(path: Path) -> set[str]:
     """Underscore names that a module uses though it did not define them."""
-    tree = ast.parse(path.read_text())
+    tree = tree_of(path)
     own, used = set(), set()
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
@@ -170,7 +176,7 @@ def test_the_walk_sees_imports():
 
 @pytest.mark.parametrize("room", ORDER)
 def test_every_folder_says_in_one_sentence_what_belongs_in_it(room):
-    doc = ast.get_docstring(ast.parse(NAMED[room].read_text()))
+    doc = ast.get_docstring(tree_of(NAMED[room]))
     first = doc.split("\n\n")[0]
     assert first.endswith(".")
     assert ". " not in first
@@ -185,7 +191,7 @@ def test_tests_lie_in_the_folders_of_what_they_test():
 
 @pytest.mark.parametrize(("layer", "path"), MODULES, ids=names(MODULES))
 def test_modules_and_what_is_public_in_them_have_docstrings(layer, path):
-    tree = ast.parse(path.read_text())
+    tree = tree_of(path)
     assert ast.get_docstring(tree), f"{path} has no docstring"
     for node in tree.body:
         if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
@@ -199,7 +205,7 @@ CORE = [path for layer, path in MODULES if layer == "cosim"]
 
 def vocabulary(path: Path) -> set[str]:
     """Words of identifiers and of texts in the code; docstrings may show examples."""
-    tree = ast.parse(path.read_text())
+    tree = tree_of(path)
     shown = set()
     for node in ast.walk(tree):
         body = getattr(node, "body", [])

@@ -22,7 +22,7 @@ from terrafix.components.sensors.files import (
     recorded_files,
     require_files,
 )
-from terrafix.components.shared import common, generator, lasting_seed, require_common
+from terrafix.components.shared import OwnOrCommon, common, generator, lasting_seed, require_common
 from terrafix.components.truth.terrain import scene_from
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.clock import Rate
@@ -97,7 +97,7 @@ def reference_from(
     return Reference(amplitude, rows, columns, *np.moveaxis(places, -1, 0))
 
 
-class EarlierPass(ReferenceSource):
+class EarlierPass(ReferenceSource, OwnOrCommon):
     """Reference of an earlier pass over an artificial scene, with speckle of its own.
 
     What an ideal processor makes of the scatterers, and not formed from echo; its orbit is that

@@ -1,9 +1,9 @@
 """Radar echo: simulated from the truth, or recorded, on the same ports.
 
 An echo is one for all members of an ensemble, published by reference; so the truth must be one for
-all of them. The beam's center passes its middle at the time of the step: half of the aperture lies
-ahead of that time, and is taken from the orbit that the truth will follow. (A flight system would
-apply the fix that much later; this delay is not modeled.)
+all of them, or members are flown one at a time (`own`). The beam's center passes its middle at the
+time of the step: half of the aperture lies ahead of that time, and is taken from the orbit that the
+truth will follow. (A flight system would apply the fix that much later; this delay is not modeled.)
 """
 
 from __future__ import annotations
@@ -23,7 +23,13 @@ from terrafix.components.sensors.files import (
     sent_by,
     settled,
 )
-from terrafix.components.shared import common, generator, require_common, shared_setting
+from terrafix.components.shared import (
+    OwnOrCommon,
+    common,
+    generator,
+    require_common,
+    shared_setting,
+)
 from terrafix.components.truth.terrain import scene_from
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -139,7 +145,7 @@ class _Echo(SendsChirps):
         )
 
 
-class SceneEcho(_Echo):
+class SceneEcho(_Echo, OwnOrCommon):
     """Echo of an artificial scene on a terrain, from the exact geometry of the true orbit.
 
     Its receive window is centered on the true boresight.

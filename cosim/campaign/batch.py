@@ -63,6 +63,8 @@ class Task:
         Folder for full records, one NetCDF file per block.
     kinds : tuple of Statistic
         What is summed up; `STATISTICS` if absent.
+    block : int
+        Members of a block: 1 where they are flown one at a time.
     key : str
         Unlike that of any other campaign.
     """
@@ -73,6 +75,7 @@ class Task:
     duration: Fraction
     histories: str | None = None
     kinds: tuple[Statistic, ...] = field(default_factory=lambda: tuple(STATISTICS))
+    block: int = BLOCK
     key: str = field(default_factory=lambda: uuid4().hex)
 
 
@@ -221,8 +224,8 @@ def _blocks(task: Task, simulation: Simulation, flight: Flight) -> list[BlockRes
     members = flight.members
     histories = {p: _padded(simulation.history(p, flight), layout) for p, layout in found.items()}
     results = []
-    for start in range(0, len(members), BLOCK):
-        part = slice(start, start + BLOCK)
+    for start in range(0, len(members), task.block):
+        part = slice(start, start + task.block)
         first = int(members[start])
         sums = {}
         for path, layout in found.items():
@@ -232,7 +235,7 @@ def _blocks(task: Task, simulation: Simulation, flight: Flight) -> list[BlockRes
         excluded = (e for e in flight.excluded if e["member"] in mine)
         results.append(
             BlockResult(
-                first // BLOCK,
+                first // task.block,
                 sums,
                 {name: values[part].copy() for name, (_, values) in flight.parameters.items()},
                 sorted(excluded, key=lambda e: e["member"]),
@@ -250,14 +253,14 @@ def _write_histories(task: Task, simulation: Simulation, flight: Flight) -> None
     folder.mkdir(parents=True, exist_ok=True)
     dataset = simulation.result(wall_s=0.0, status="part of a campaign", flight=flight).dataset
     members = flight.members
-    for start in range(0, len(members), BLOCK):
-        part = dataset.isel(member=slice(start, start + BLOCK))
+    for start in range(0, len(members), task.block):
+        part = dataset.isel(member=slice(start, start + task.block))
         part.attrs |= {
             "excluded": "",
             "evaluation": "",
-            "members": str(members[start : start + BLOCK]),
+            "members": str(members[start : start + task.block]),
         }
-        write_netcdf(part, folder / f"{int(members[start]) // BLOCK:06d}.nc")
+        write_netcdf(part, folder / f"{int(members[start]) // task.block:06d}.nc")
 
 
 def single_threaded() -> None:

@@ -29,7 +29,7 @@ from terrafix.cosim.campaign.statistics.ensemble import STANDARD, STATISTICS, St
 from terrafix.cosim.campaign.statistics.statistic import BLOCK
 from terrafix.cosim.campaign.store import RESULT, SUMMARY, Store
 from terrafix.cosim.campaign.verdict import judge
-from terrafix.cosim.engine.simulation import MAX_MEMBER, Simulation
+from terrafix.cosim.engine.simulation import MAX_MEMBER, Simulation, flown_alone
 from terrafix.cosim.system.identity import configuration
 from terrafix.cosim.system.system import System
 
@@ -123,7 +123,14 @@ def run_campaign(
             source=_described(source),
             parameter_units={name: unit for name, (unit, _) in simulation.parameters.items()},
         )
-        size = batch or members_per_batch(simulation, found)
+        path = flown_alone(simulation.plan)
+        if path is not None and batch is not None:
+            raise ConfigurationError(
+                f"batch does nothing: '{path}' shares what is of one member, so members are flown "
+                "one at a time\n  leave it out"
+            )
+        block = BLOCK if path is None else 1
+        size = block if path is not None else batch or members_per_batch(simulation, found)
     finally:
         simulation.master.terminate()
     store = None
@@ -132,7 +139,7 @@ def run_campaign(
         store = Store(result.out, _identity(result, histories=histories), resume=resume)
     try:
         kept = str(Path(out) / "histories") if out and histories else None
-        task = Task(source, runs, root, length, kept, kinds)
+        task = Task(source, runs, root, length, kept, kinds, block)
         result.setup_s = time.perf_counter() - began
         _fly(result, task, store, size, workers, dask, progress, started)
         result.verdicts = {path: judge(s) for path, s in result.statistics.items()}
@@ -237,7 +244,7 @@ def _fly(
     progress: Progress | None,
     started: Callable[[Any], None] | None,
 ) -> None:
-    n_blocks = -(-result.runs // BLOCK)
+    n_blocks = -(-result.runs // task.block)
     done = store.done() & set(range(n_blocks)) if store is not None else set()
     ready: dict[int, BlockResult | None] = dict.fromkeys(sorted(done))
     merged = 0
@@ -259,7 +266,7 @@ def _fly(
     result.workers = "nobody: all blocks were there"
     while merged < n_blocks:
         missing = [b for b in range(merged, n_blocks) if b not in ready]
-        batches = _batches(missing, size, result.runs, workers, dask)
+        batches = _batches(missing, size, task, workers, dask)
         flown, result.workers = _flown(task, batches, workers, dask, started)
         n_done = len(done)
         try:
@@ -271,13 +278,13 @@ def _fly(
                     n_done += 1
                 merge()
         except KeyboardInterrupt as error:
-            raise CampaignError(_kept("interrupted", n_done, n_blocks, result)) from error
+            raise CampaignError(_kept("interrupted", n_done, n_blocks, task, result)) from error
         except TerrafixError as error:
             if n_done == 0 and isinstance(error, ConfigurationError):
                 if store is not None:
                     store.forget()
                 raise
-            raise CampaignError(_kept(str(error), n_done, n_blocks, result)) from error
+            raise CampaignError(_kept(str(error), n_done, n_blocks, task, result)) from error
         finally:
             flown.close()  # type: ignore[attr-defined]
     if all(not s.n[-1] for s in result.statistics.values()):
@@ -288,13 +295,14 @@ def _fly(
 
 
 def _batches(
-    missing: list[int], size: int, runs: int, workers: int | None, dask: str | None
+    missing: list[int], size: int, task: Task, workers: int | None, dask: str | None
 ) -> list[pools.Batch]:
     """Consecutive blocks together, up to `size` members; enough batches that nobody is idle."""
     n_workers = workers or processors()
-    share = -(-len(missing) // n_workers) * BLOCK
-    largest = min(size, share) if dask is None and len(missing) * BLOCK > size else size
-    per_batch = max(1, largest // BLOCK)
+    block, runs = task.block, task.runs
+    share = -(-len(missing) // n_workers) * block
+    largest = min(size, share) if dask is None and len(missing) * block > size else size
+    per_batch = max(1, largest // block)
     batches: list[pools.Batch] = []
     start = 0
     while start < len(missing):
@@ -303,7 +311,7 @@ def _batches(
             end < len(missing) and end - start < per_batch and missing[end] == missing[end - 1] + 1
         ):
             end += 1
-        batches.append((missing[start] * BLOCK, min((missing[end - 1] + 1) * BLOCK, runs)))
+        batches.append((missing[start] * block, min((missing[end - 1] + 1) * block, runs)))
         start = end
     return batches
 
@@ -338,11 +346,12 @@ def _refuse_unpicklable(task: Task) -> None:
         ) from error
 
 
-def _kept(what: str, done: int, total: int, result: CampaignResult) -> str:
+def _kept(what: str, done: int, total: int, task: Task, result: CampaignResult) -> str:
+    blocks = f"blocks of {task.block} members" if task.block > 1 else "members"
     if result.out is None:
-        return f"{what}\n  {done} of {total} blocks of {BLOCK} members were done; none is kept"
+        return f"{what}\n  {done} of {total} {blocks} were done; none is kept"
     return (
-        f"{what}\n  {done} of {total} blocks of {BLOCK} members are done, and kept in "
+        f"{what}\n  {done} of {total} {blocks} are done, and kept in "
         f"'{result.out}'\n  complete them with --out {result.out} --resume"
     )
 

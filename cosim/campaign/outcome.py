@@ -14,7 +14,7 @@ import numpy as np
 from terrafix.cosim.basics.clock import text_seconds
 from terrafix.cosim.campaign.batch import BlockResult
 from terrafix.cosim.campaign.statistics.ensemble import Statistics
-from terrafix.cosim.campaign.statistics.statistic import BLOCK, SHOWN
+from terrafix.cosim.campaign.statistics.statistic import SHOWN
 from terrafix.cosim.campaign.verdict import Verdict
 
 MOST_NAMED = 1000
@@ -77,9 +77,9 @@ class Outcome:
             self.reasons[each["reason"]] = self.reasons.get(each["reason"], 0) + 1
             if len(self.excluded) < MOST_NAMED:
                 self.excluded.append(each)
-        if block.number * BLOCK < SHOWN:
-            for name, values in block.parameters.items():
-                before = [self.parameters[name]] if name in self.parameters else []
+        for name, values in block.parameters.items():
+            before = [self.parameters[name]] if name in self.parameters else []
+            if sum(map(len, before)) < SHOWN:
                 self.parameters[name] = np.concatenate([*before, values])
         kinds = {k for k in [*self.kernel.split("+"), *block.kernel.split("+")] if k}
         self.kernel = "+".join(sorted(kinds))

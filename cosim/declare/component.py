@@ -326,6 +326,10 @@ class Component(Shown):
         with_these = f" with {', '.join(chosen)}" if chosen else ""
         return f"'{self.name}' does not take '{name}'{with_these}: it would change nothing"
 
+    def alone(self) -> bool:
+        """Whether what it shares is of one member, as it is set: members fly one at a time."""
+        return False
+
     def missing_settings(self) -> list[str]:
         """Names of required parameters that were not given."""
         declared = type(self).settings()

@@ -91,6 +91,7 @@ class Simulation:
         self.seed = system.seed if seed is None else seed
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise ConfigurationError(f"seed is {self.seed!r}; it is a whole number from 0 on")
+        _refuse_together(self.plan, len(self.members))
         _refuse_too_large(self.plan, len(self.members))
         self.runs = int(self.members.max()) + 1 if runs is None else runs
         self.folder = folder
@@ -371,6 +372,20 @@ def _standing(simulation: Simulation) -> str:
         f"t = {master.seconds(master.tick):g} s"
         + ("" if simulation.initialized else ", not initialized")
     )
+
+
+def flown_alone(plan: Plan) -> str | None:
+    """Path of a component that shares what is of one member, so that members fly one at a time."""
+    return next((p for p, c in plan.flat.components.items() if c.alone()), None)
+
+
+def _refuse_together(plan: Plan, n_members: int) -> None:
+    path = flown_alone(plan)
+    if path is not None and n_members > 1:
+        raise ConfigurationError(
+            f"what '{path}' shares is of one member, as it is set, and {n_members} are to be flown "
+            "together\n  fly them one at a time: terrafix campaign --runs N, or --members 1"
+        )
 
 
 def _refuse_too_large(plan: Plan, n_members: int) -> None:

@@ -87,24 +87,33 @@ def test_commands_in_the_text_of_an_example_are_right(example):
         read_system(example, [(path, value) for path, value in settings])
 
 
+def all_pairs(options):
+    """Selections in which each option of a choice meets each of every other choice."""
+    met = set()
+    for picked in itertools.product(*options.values()):
+        selection = list(zip(options, picked, strict=True))
+        pairs = {*itertools.combinations(selection, min(2, len(selection)))}
+        if pairs - met:
+            yield selection
+        met |= pairs
+
+
 def test_every_choice_of_an_example_passes_the_check(example):
     choices = tomllib.loads(example.read_text()).get("choice", {})
     options = {n: [o for o, v in c.items() if isinstance(v, dict)] for n, c in choices.items()}
-    for picked in itertools.product(*options.values()):
-        read_system(example, list(zip(options, picked, strict=True)))
+    for selection in all_pairs(options):
+        read_system(example, selection)
 
 
 def test_an_example_runs_and_survives_being_written_and_read(example, tmp_path):
-    """The same configuration, the same bytes of results, and the same text when written again."""
+    """The same configuration, and the same text when written again; what was written is flown."""
     original = read_system(example)
     write_system(original, tmp_path / "again.toml")
     again = read_system(tmp_path / "again.toml")
     assert configuration(check(again)) == configuration(check(original))
     for name in ("name", "doc", "duration", "members", "seed"):
         assert getattr(again, name) == getattr(original, name)
-    flown = fly(original)
-    assert flown.sizes["member"] == FEW
-    assert payload(fly(again)) == payload(flown)
+    assert fly(again).sizes["member"] == FEW
     write_system(again, tmp_path / "third.toml")
     assert (tmp_path / "third.toml").read_text() == (tmp_path / "again.toml").read_text()
 

@@ -62,28 +62,28 @@ def measured_less_true(data):
 
 @pytest.fixture(scope="module")
 def flight():
-    return flown(seconds=3)
+    return flown(seconds=2)
 
 
 def test_images_measure_the_true_track_and_correct_the_navigator(flight):
     """Off by 3, 1, 3 m (1 sigma) at the start, the images still say where the aircraft was.
 
-    0.3 m is five sigmas of an image. The second and third were formed with what the first had
-    corrected: what they are off by is that, no longer the start's 5.5 m along the track.
+    0.3 m is five sigmas of an image. The second was formed with what the first had corrected:
+    what it is off by is that, no longer the start's 5.5 m along the track.
     """
     assert np.abs(measured_less_true(flight)).max() < 0.3
-    residual = flight["matcher.residual"].values[[2, 4, 6], 0]
+    residual = flight["matcher.residual"].values[[2, 4], 0]
     assert np.abs(residual[0]).max() > 3.0
-    assert np.abs(residual[1:]).max() < 0.5
+    assert np.abs(residual[1]).max() < 0.5
     assert (flight["evaluation.radar_accepted"].values[1:, 0] == 1).all()
     assert (flight["evaluation.radar_nis_dof"].values[1:, 0] == 3).all()
 
 
 def test_map_drift_reads_what_the_track_is_off_by(flight):
     """Within 0.2 m/s (five sigmas) of what the true velocity is, of which 0.1 was not known."""
-    drift = flight["former.image.drift"].values[[2, 4, 6], 0]
-    line = np.linalg.norm(flight["former.image.v_e"].values[[2, 4, 6], 0], axis=1)
-    assert (flight["former.image.focused"].values[[2, 4, 6], 0] == 1).all()
+    drift = flight["former.image.drift"].values[[2, 4], 0]
+    line = np.linalg.norm(flight["former.image.v_e"].values[[2, 4], 0], axis=1)
+    assert (flight["former.image.focused"].values[[2, 4], 0] == 1).all()
     assert np.abs(line + drift - 70.0).max() < 0.2
 
 
@@ -125,15 +125,14 @@ def test_a_run_taken_up_again_goes_on_to_the_same_bytes():
 
 def test_nothing_is_found_on_a_featureless_field():
     """No fix, and no map drift: the navigator flies on with what it has."""
-    data = flown(*BARE, FEWEST, seconds=2)
-    reasons = {REASONS[int(k)] for k in data["matcher.reason"].values[[2, 4], 0]}
-    assert "accepted" not in reasons
-    assert (data["former.image.focused"].values[[2, 4], 0] == 0).all()
+    data = flown(*BARE, FEWEST, seconds=1)
+    assert REASONS[int(data["matcher.reason"].values[2, 0])] != "accepted"
+    assert data["former.image.focused"].values[2, 0] == 0
     assert np.isnan(data["evaluation.radar_nis"].values[:, 0]).all()
 
 
 def test_a_radar_that_is_off_sends_nothing():
-    data = flown(("radar.on", "false"), seconds=2)
+    data = flown(("radar.on", "false"), seconds=1)
     assert np.isnan(data["evaluation.radar_accepted"].values).all()
 
 

@@ -14,7 +14,7 @@ from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.evaluation import Evaluation, Quantity
 from terrafix.cosim.declare.parameters import Parameter
-from terrafix.cosim.declare.ports import Input, Output
+from terrafix.cosim.declare.ports import Input, Output, SharedOutput
 from terrafix.cosim.kernels.symbolic import SymbolicComponent
 from terrafix.cosim.system.system import System
 from terrafix.models.core.model import Model
@@ -129,6 +129,22 @@ class Tripwire(Component):
         if t == 7 and (self.environment.members == self.victim).any():
             raise ValueError("the wire was touched")
         self.y = self.u
+
+
+class Lonely(Component):
+    """Shares the truth of one member."""
+
+    default_rate = Rate("1")
+    truth = Input(unit="m")
+    shared = SharedOutput((1,), unit="m")
+
+    def alone(self):
+        """Whether what it shares is of one member."""
+        return True
+
+    def _step_impl(self, t, dt):
+        assert self.n_members == 1
+        self.shared = self.truth.copy()
 
 
 class Hold(Component):
