@@ -9,13 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
+from terrafix.components.sensors.compiled import row_operations
 from terrafix.components.shared import shared_setting
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.models.radar.chirp import SPEED_OF_LIGHT
+from terrafix.models.core.arrays import FloatArray
+from terrafix.models.radar.boresight import Boresight
+from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Radar
+from terrafix.models.radar.doppler import fractional_centroid, unwrapped_centroid
 from terrafix.models.radar.recordings.files import read_recording
 from terrafix.models.radar.recordings.recording import Recording, Sent
+from terrafix.models.radar.recordings.slips import Seen, without_slips
+from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
 _log = logging.getLogger(__name__)
 _ALIKE = 1e-6
@@ -23,9 +29,12 @@ _ALIKE = 1e-6
 
 
 def read_lines(component: Component, path: Path, *, report: bool = False) -> Recording:
-    """Recording in a file of a component; `report` says if lines were lost."""
+    """Recording in a file of a component; `report` says if lines were lost.
+
+    Lines may have slipped: `in_place` puts them where they belong.
+    """
     try:
-        lines = read_recording(path, _channel(component))
+        lines = read_recording(path, _channel(component), slips=True)
     except (OSError, ValueError) as error:
         raise ConfigurationError(
             f"'{component.name}' cannot read its echo: {error}\n"
@@ -35,6 +44,52 @@ def read_lines(component: Component, path: Path, *, report: bool = False) -> Rec
     if report and lines.told():
         _log.warning("'%s' reads '%s': %s", component.name, path.name, lines.told())
     return lines
+
+
+def in_place(
+    component: Component,
+    lines: Recording,
+    radar: Radar,
+    near: float,
+    beam: Boresight,
+    states: tuple[FloatArray, FloatArray],
+) -> Recording:
+    """A recording whose lines are where they belong, by what is seen before and after a slip.
+
+    Parameters
+    ----------
+    component : Component
+    lines : Recording
+    radar : Radar
+    near : float
+        Slant range of the first cell [m].
+    beam : Boresight
+        In the middle of it.
+    states : tuple of ndarray, shape (3,)
+        Position [m] and velocity [m/s] of the radar then, Earth-fixed.
+
+    Raises
+    ------
+    ConfigurationError
+        If what is seen does not tell how many lines were lost.
+    """
+    if not lines.slips:
+        return lines
+    fraction, _ = fractional_centroid(lines.read(0, lines.slips[0]), radar.prf)
+    centroid = unwrapped_centroid(fraction, radar.prf, beam.doppler(radar.wavelength))
+    velocity = float(effective_velocity_array(*states, beam.point))
+    seen = Seen(radar, near, float(centroid), velocity, row_operations())
+    try:
+        found = without_slips(lines, seen)
+    except ValueError as error:
+        raise ConfigurationError(
+            f"'{component.name}' cannot use '{lines.path}': {lines.slipped()}\n  {error}"
+        ) from error
+    _log.warning(
+        "'%s' found by the echo of '%s' that lines slipped, and put them where they belong: %s",
+        *(component.name, lines.path.name, found.told()),
+    )
+    return found
 
 
 def sent_by(component: Component) -> Sent | None:
@@ -69,7 +124,7 @@ def _told(component: Component, path: Path) -> Sent | None:
 @lru_cache(maxsize=64)
 def _sent(path: Path, channel: str, _changed: int, _size: int) -> Sent | None:
     """What a file says of its radar, as long as it stays as it is: files are large."""
-    return read_recording(path, channel).sent
+    return read_recording(path, channel, slips=True).sent
 
 
 def _channel(component: Component) -> str:
