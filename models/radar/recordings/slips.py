@@ -5,7 +5,7 @@ ground, from the two halves of the aperture. Lines after the slip are too early 
 lost, and so is what they show. A velocity that is a little wrong displaces looks, too; by how much
 is measured where nothing was lost, half an aperture away or farther, and taken off.
 
-On RADARSAT-1's chunks lengths come out whole to 0.1 lines rms (benchmarks/lost_lines.py).
+On RADARSAT-1's chunks lengths are whole numbers to 0.12 lines rms (benchmarks/lost_lines.py).
 """
 
 from __future__ import annotations
