@@ -88,7 +88,8 @@ def _history(path: Path, reader: Any, channel: str) -> PhaseHistory:
         raise ValueError("it was sent and received in different places (bistatic)")
     center = np.array([float(_text(tree, f"SceneCoordinates/IARP/ECF/{x}")) for x in "XYZ"])
     step = float(numbers["SCSS"][0])
-    frequency = float(numbers["SC0"][0]) + step * np.arange(k)[cells]
+    steps = np.arange(k, dtype=np.float64)[cells]
+    frequency = np.asarray(float(numbers["SC0"][0]) + step * steps, np.float64)
     return PhaseHistory(
         *(phase, frequency, (middle - center) @ local_axes(center).T, reference),
         (numbers["TxTime"] + numbers["RcvTime"]) / 2,

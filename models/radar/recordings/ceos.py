@@ -27,6 +27,7 @@ References
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -268,13 +269,13 @@ def _layout(path: Path) -> tuple[np.dtype[np.void], int]:
         )
     if n < 2:
         raise ValueError("it has one line")
-    prefix = {
+    prefix: Any = {
         "names": list(_FIELDS),
         "formats": [kind for _, kind in _FIELDS.values()],
         "offsets": [at - 1 for at, _ in _FIELDS.values()],
         "itemsize": _PREFIX,
     }
-    layout = {
+    layout: Any = {
         "names": ["prefix", "samples"],
         "formats": [np.dtype(prefix), f"({n_bytes},)u1"],
         "offsets": [0, _PREFIX],
@@ -476,4 +477,4 @@ def _body_axes(r: FloatArray, v: FloatArray, angles: FloatArray) -> FloatArray:
             [cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr],
         ]
     )
-    return np.einsum("ijn,njk->nik", turned, level)
+    return np.asarray(np.einsum("ijn,njk->nik", turned, level), np.float64)

@@ -76,7 +76,7 @@ def test_no_slip_is_not_filled(whole):
 
 
 def test_too_little_beside_a_slip_is_refused(whole):
-    with pytest.raises(ValueError, match="60 lines are seen beside line 61, and 13. are wanted"):
+    with pytest.raises(ValueError, match=r"60 lines are seen beside line 61, and 13. are wanted"):
         without_slips(slipped(whole, (60,)), SEEN)
 
 
