@@ -29,7 +29,7 @@ FORMATS = (
     "first_rg_cell, or NISAR L0B (HDF5)"
 )
 IMAGE = "an image, formed already: name the raw echo (level 0) that it was formed of"
-_MOVED = 0.07
+_MOVED = 0.08
 """Lines that an image is moved by where 3 to 10 lines of its aperture are zeros, rms: measured by
 benchmarks/lost_lines.py."""
 _BLOCK = 2**22

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import ceos_files
 import numpy as np
 import pytest
 from l0b_files import NEAR, PRF, beam, codes, write
@@ -117,8 +118,8 @@ def test_lines_are_published_when_and_where_they_were_received(
     monkeypatch.setattr(component, "_publish", lambda *args, **more: sent.append((*args, more)))
     component.step(0.1, 0.1)
     t, echo, first_time, first_range, more = sent[0]
-    # 0.07 lines rms are what zeros in the place of lost lines move an image by
-    expected = 0.07 / PRF if files == "b.h5" else 0.0
+    # 0.08 lines rms are what zeros in the place of lost lines move an image by
+    expected = 0.08 / PRF if files == "b.h5" else 0.0
     assert more["time_sigma"] == pytest.approx(expected, rel=1e-9)
     assert t == 0.1
     assert first_time == pytest.approx(20 / PRF, abs=1e-9)
@@ -128,6 +129,23 @@ def test_lines_are_published_when_and_where_they_were_received(
     component.step_index = 0
     with pytest.raises(ConfigurationError, match="its lines were received from"):
         component.step(1.0, 1.0)
+
+
+def test_ceos_says_what_its_times_leave_open(tmp_path, monkeypatch):
+    """Radar and near range of its leader and lines; half a millisecond of its times is not known."""
+    ceos_files.leader(tmp_path)
+    path = ceos_files.write(tmp_path, ceos_files.coded(beam(N, 160) / 2))
+    component = radar(tmp_path, path.name, start_line=7.0)
+    component.validate()
+    assert component._radar().chirp_rate == pytest.approx(-14e6 / 8e-6)
+    members = np.arange(1)
+    component.bind(Environment("echo", 0, members, members >= 0, lambda *_: None, False))
+    sent = []
+    monkeypatch.setattr(component, "_publish", lambda *args, **more: sent.append((*args, more)))
+    component.step(0.1, 0.1)
+    t, echo, first_time, near, more = sent[0]
+    assert (t, echo.shape, first_time, near) == (0.1, (N, 160), 0.0, NEAR)
+    assert more["time_sigma"] == pytest.approx(1e-3 / np.sqrt(12))
 
 
 def heard(tmp_path, path, torn):
@@ -156,7 +174,7 @@ def test_lines_that_slipped_are_put_where_they_belong(tmp_path, caplog):
     data = heard(tmp_path, path, np.s_[900:910])
     assert "10 of its 1536 lines are lost, the first is line 901" in caplog.text
     sigma = data["echo.acquired.time_sigma"].to_numpy()
-    assert sigma[np.isfinite(sigma)] == pytest.approx(0.07 / 1256.98)
+    assert sigma[np.isfinite(sigma)] == pytest.approx(0.08 / 1256.98)
 
 
 def test_a_slip_that_the_echo_does_not_tell_is_refused(tmp_path):
