@@ -132,7 +132,7 @@ def test_lines_are_published_when_and_where_they_were_received(
 
 
 def test_ceos_says_what_its_times_leave_open(tmp_path, monkeypatch):
-    """Radar and near range of its leader and lines; half a millisecond of its times is not known."""
+    """Radar and near range of its leader and lines; half a millisecond of its times is open."""
     ceos_files.leader(tmp_path)
     path = ceos_files.write(tmp_path, ceos_files.coded(beam(N, 160) / 2))
     component = radar(tmp_path, path.name, start_line=7.0)
