@@ -189,10 +189,26 @@ class Recording:
         ValueError
             If the recording has no orbit or no times, or they do not meet.
         """
+        orbit, times = self._located()
+        return orbit.at(times)
+
+    @property
+    def start(self) -> float:
+        """When its first line was sent, after the first state of its orbit [s].
+
+        Raises
+        ------
+        ValueError
+            If the recording has no orbit or no times.
+        """
+        return float(self._located()[1][0])
+
+    def _located(self) -> tuple[Ephemeris, FloatArray]:
+        """Orbit, and times of lines after its first state [s]."""
         if self.track is None or self.track.orbit is None or self.line_time is None:
             raise ValueError(f"'{self.path}' has no orbit, or no times of its lines")
         orbit = self.track.orbit
-        return orbit.at(self.line_time + seconds(self.track.epoch - orbit.tags[0]))
+        return orbit, self.line_time + seconds(self.track.epoch - orbit.tags[0])
 
     def error_of_times(self, prf: float) -> float:
         """Standard error of the times of what an image of it shows [s].
