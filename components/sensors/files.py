@@ -24,6 +24,8 @@ from terrafix.models.radar.recordings.slips import Seen, without_slips
 from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
 _log = logging.getLogger(__name__)
+_MOST_KEPT = 32 * 1024 * 1024
+"""Bytes of a file of arrays that is kept in memory between steps."""
 _ALIKE = 1e-6
 """How far a setting may be from what a file says, relative to it."""
 
@@ -34,7 +36,7 @@ def read_lines(component: Component, path: Path, *, report: bool = False) -> Rec
     Lines may have slipped: `in_place` puts them where they belong.
     """
     try:
-        lines = read_recording(path, _channel(component), slips=True)
+        lines = _read(path, _channel(component))
     except (OSError, ValueError) as error:
         raise ConfigurationError(
             f"'{component.name}' cannot read its echo: {error}\n"
@@ -101,7 +103,7 @@ def sent_by(component: Component) -> Sent | None:
         If a file cannot be read, or they do not agree.
     """
     paths = recorded_files(component)
-    told = [_told(component, path) for path in paths]
+    told = [read_lines(component, path).sent for path in paths]
     for path, sent in zip(paths[1:], told[1:], strict=True):
         if (sent is None) != (told[0] is None) or (sent and told[0] and not _alike(sent, told[0])):
             raise ConfigurationError(
@@ -111,20 +113,20 @@ def sent_by(component: Component) -> Sent | None:
     return told[0]
 
 
-def _told(component: Component, path: Path) -> Sent | None:
+def _read(path: Path, channel: str) -> Recording:
+    """A recording, looked through once as long as its file stays as it is."""
     if not path.is_file():
-        return read_lines(component, path).sent
+        return read_recording(path, channel)
     stat = path.stat()
-    try:
-        return _sent(path, _channel(component), stat.st_mtime_ns, stat.st_size)
-    except (OSError, ValueError):
-        return read_lines(component, path).sent
+    # of arrays all are in memory, of other formats none
+    if path.suffix == ".npz" and stat.st_size > _MOST_KEPT:
+        return read_recording(path, channel, slips=True)
+    return _read_once(path, channel, stat.st_mtime_ns, stat.st_size)
 
 
-@lru_cache(maxsize=64)
-def _sent(path: Path, channel: str, _changed: int, _size: int) -> Sent | None:
-    """What a file says of its radar, as long as it stays as it is: files are large."""
-    return read_recording(path, channel, slips=True).sent
+@lru_cache(maxsize=4)
+def _read_once(path: Path, channel: str, _changed: int, _size: int) -> Recording:
+    return read_recording(path, channel, slips=True)
 
 
 def _channel(component: Component) -> str:

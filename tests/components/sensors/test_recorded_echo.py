@@ -159,6 +159,8 @@ def heard(tmp_path, path, torn):
     for name in [n for n in system.nodes if n not in TRUTH]:
         system.remove(name)
     system.records.clear()
+    for name in ("orbit", "attitude", "antenna"):
+        system.nodes[name].rate = Rate(hz=10)
     system.nodes["echo"].folder = tmp_path
     system.nodes["echo"].files = "torn.npz"
     system.nodes["echo"].rate = Rate(times=["6.09"])
