@@ -60,7 +60,7 @@ benchmarks: $(STAMP)
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/sentinel1"; \
 	    then $(BIN)/python benchmarks/real_orbit.py real filter; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/radarsat1_vancouver"; \
-	    then $(BIN)/python benchmarks/real_echo.py; fi
+	    then $(BIN)/python benchmarks/real_echo.py; $(BIN)/python benchmarks/lost_lines.py; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/afrl_gotcha"; \
 	    then $(BIN)/python benchmarks/gotcha.py; fi
 	@if test -d "$${TERRAFIX_DATA:-../shared/data}/lakes_gshhg"; \

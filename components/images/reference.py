@@ -17,6 +17,7 @@ from terrafix.components.sensors.compiled import row_operations, speckle_of_bits
 from terrafix.components.sensors.echo import RecordedEcho
 from terrafix.components.sensors.files import (
     file_of_step,
+    in_place,
     near_range,
     read_lines,
     recorded_files,
@@ -349,9 +350,9 @@ class RecordedReference(ReferenceSource):
         )
         dem = dem_from(self.height, self.grid)
         aligned = np.array([0.0, 0.0, 0.0, 1.0])
-        duration = lines.n_lines / radar.prf
         try:
             beam = boresight_on_terrain(r, v, q_be, aligned, float(look), float(squint), dem)
+            lines = in_place(self, lines, radar, near, beam, (r, v))
             imager = Imager(
                 lines.read(),
                 radar,
@@ -374,7 +375,7 @@ class RecordedReference(ReferenceSource):
                 velocity_rate=field.by_time,
             )
             image = imager.image(processing, focus.velocity if focus.accepted else velocity)
-            reach = abs(first_time) + 3 * duration
+            reach = abs(first_time) + 3 * lines.n_lines / radar.prf
             arc = OrbitArc(r, v, 0.0, reach, reach)
             looks = self.azimuth_looks, self.range_looks
             reference = geocoded(image, arc, dem.at, looks, side=beam.side)

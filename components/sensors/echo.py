@@ -16,6 +16,7 @@ from terrafix.components.fields import ACQUISITION, ECHO, GRID, HEIGHT, RADAR, S
 from terrafix.components.sensors.compiled import row_operations, speckle_of_bits
 from terrafix.components.sensors.files import (
     file_of_step,
+    in_place,
     near_range,
     read_lines,
     recorded_files,
@@ -289,7 +290,11 @@ class RecordedEcho(_Echo):
         path = file_of_step(self)
         lines = read_lines(self, path, report=True)
         self._check_time(lines, path, t)
+        near = self._near_range(lines)
+        if lines.slips:
+            states = common(self, "r_e"), common(self, "v_e")
+            lines = in_place(self, lines, self._radar(), near, self._boresight(), states)
         self._publish(
-            *(t, lines.read(), self._first_time(lines), self._near_range(lines)),
+            *(t, lines.read(), self._first_time(lines), near),
             time_sigma=lines.error_of_times(self._sends("prf")),
         )

@@ -9,23 +9,34 @@ from pathlib import Path
 
 import numpy as np
 
+from terrafix.components.sensors.compiled import row_operations
 from terrafix.components.shared import shared_setting
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.models.radar.chirp import SPEED_OF_LIGHT
+from terrafix.models.core.arrays import FloatArray
+from terrafix.models.radar.boresight import Boresight
+from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Radar
+from terrafix.models.radar.doppler import fractional_centroid, unwrapped_centroid
 from terrafix.models.radar.recordings.files import read_recording
 from terrafix.models.radar.recordings.recording import Recording, Sent
+from terrafix.models.radar.recordings.slips import Seen, without_slips
+from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
 _log = logging.getLogger(__name__)
+_MOST_KEPT = 32 * 1024 * 1024
+"""Bytes of a file of arrays that is kept in memory between steps."""
 _ALIKE = 1e-6
 """How far a setting may be from what a file says, relative to it."""
 
 
 def read_lines(component: Component, path: Path, *, report: bool = False) -> Recording:
-    """Recording in a file of a component; `report` says if lines were lost."""
+    """Recording in a file of a component; `report` says if lines were lost.
+
+    Lines may have slipped: `in_place` puts them where they belong.
+    """
     try:
-        lines = read_recording(path, _channel(component))
+        lines = _read(path, _channel(component))
     except (OSError, ValueError) as error:
         raise ConfigurationError(
             f"'{component.name}' cannot read its echo: {error}\n"
@@ -37,6 +48,52 @@ def read_lines(component: Component, path: Path, *, report: bool = False) -> Rec
     return lines
 
 
+def in_place(
+    component: Component,
+    lines: Recording,
+    radar: Radar,
+    near: float,
+    beam: Boresight,
+    states: tuple[FloatArray, FloatArray],
+) -> Recording:
+    """A recording whose lines are where they belong, by what is seen before and after a slip.
+
+    Parameters
+    ----------
+    component : Component
+    lines : Recording
+    radar : Radar
+    near : float
+        Slant range of the first cell [m].
+    beam : Boresight
+        In the middle of it.
+    states : tuple of ndarray, shape (3,)
+        Position [m] and velocity [m/s] of the radar then, Earth-fixed.
+
+    Raises
+    ------
+    ConfigurationError
+        If what is seen does not tell how many lines were lost.
+    """
+    if not lines.slips:
+        return lines
+    fraction, _ = fractional_centroid(lines.read(0, lines.slips[0]), radar.prf)
+    centroid = unwrapped_centroid(fraction, radar.prf, beam.doppler(radar.wavelength))
+    velocity = float(effective_velocity_array(*states, beam.point))
+    seen = Seen(radar, near, float(centroid), velocity, row_operations())
+    try:
+        found = without_slips(lines, seen)
+    except ValueError as error:
+        raise ConfigurationError(
+            f"'{component.name}' cannot use '{lines.path}': {lines.slipped()}\n  {error}"
+        ) from error
+    _log.warning(
+        "'%s' found by the echo of '%s' that lines slipped, and put them where they belong: %s",
+        *(component.name, lines.path.name, found.told()),
+    )
+    return found
+
+
 def sent_by(component: Component) -> Sent | None:
     """What the files of a component say that their radar sends; None if they say nothing.
 
@@ -46,7 +103,7 @@ def sent_by(component: Component) -> Sent | None:
         If a file cannot be read, or they do not agree.
     """
     paths = recorded_files(component)
-    told = [_told(component, path) for path in paths]
+    told = [read_lines(component, path).sent for path in paths]
     for path, sent in zip(paths[1:], told[1:], strict=True):
         if (sent is None) != (told[0] is None) or (sent and told[0] and not _alike(sent, told[0])):
             raise ConfigurationError(
@@ -56,20 +113,20 @@ def sent_by(component: Component) -> Sent | None:
     return told[0]
 
 
-def _told(component: Component, path: Path) -> Sent | None:
+def _read(path: Path, channel: str) -> Recording:
+    """A recording, looked through once as long as its file stays as it is."""
     if not path.is_file():
-        return read_lines(component, path).sent
+        return read_recording(path, channel)
     stat = path.stat()
-    try:
-        return _sent(path, _channel(component), stat.st_mtime_ns, stat.st_size)
-    except (OSError, ValueError):
-        return read_lines(component, path).sent
+    # of arrays all are in memory, of other formats none
+    if path.suffix == ".npz" and stat.st_size > _MOST_KEPT:
+        return read_recording(path, channel, slips=True)
+    return _read_once(path, channel, stat.st_mtime_ns, stat.st_size)
 
 
-@lru_cache(maxsize=64)
-def _sent(path: Path, channel: str, _changed: int, _size: int) -> Sent | None:
-    """What a file says of its radar, as long as it stays as it is: files are large."""
-    return read_recording(path, channel).sent
+@lru_cache(maxsize=4)
+def _read_once(path: Path, channel: str, _changed: int, _size: int) -> Recording:
+    return read_recording(path, channel, slips=True)
 
 
 def _channel(component: Component) -> str:

@@ -571,18 +571,16 @@ class RecordedAttitude(Playback):
             super()._initialize_impl()
             return
         self._begin = self._first(self._body, self.environment.epoch)
-        self._last_q = self._attitude(self._body, self._begin)
-        self.q_be = self._last_q
+        self.q_be = self._attitude(self._body, self._begin)
         self.delta_v_b = self.delta_theta_b = 0.0
 
     def _step_impl(self, t: float, dt: float) -> None:
         if self._body is None:
             super()._step_impl(t, dt)
             return
-        q = self._attitude(self._body, self._begin + t)
-        q *= 1.0 if q @ self._last_q >= 0 else -1.0
+        now = self._begin + t
+        last, q = (self._attitude(self._body, at) for at in (max(now - dt, self._begin), now))
         turn = np.array([0.0, 0.0, np.sin(_EARTH_RATE * dt / 2), np.cos(_EARTH_RATE * dt / 2)])
-        moved = product_array(product_array(q, turn), inverse_array(self._last_q))
+        moved = product_array(product_array(q, turn), inverse_array(last))
         self.q_be, self.delta_theta_b = q, rotation_vector_array(moved)
         self.delta_v_b = 0.0
-        self._last_q = q

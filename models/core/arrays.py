@@ -91,7 +91,7 @@ def _array(archive: Any, key: str) -> NDArray[Any]:
 
 
 def _check_size(archive: Any, key: str) -> None:
-    """Look whether an array has the bytes that its shape wants, before there is room made for it."""
+    """Look whether an array has the bytes that its shape wants, before it gets room for them."""
     info = archive.zip.getinfo(f"{key}.npy")
     with archive.zip.open(info) as member:
         version = np.lib.format.read_magic(member)
@@ -100,6 +100,6 @@ def _check_size(archive: Any, key: str) -> None:
         wanted = math.prod(shape) * dtype.itemsize + member.tell()
     if not dtype.hasobject and wanted > info.file_size:
         raise ValueError(
-            f"its '{key}' is damaged: it says shape {shape} of {dtype}, which is {wanted} bytes, and "
-            f"has {info.file_size}"
+            f"its '{key}' is damaged: it says shape {shape} of {dtype}, which is {wanted} bytes, "
+            f"and has {info.file_size}"
         )

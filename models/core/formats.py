@@ -20,6 +20,7 @@ _KINDS = (
     (b"\0\0\0\1\x0b\xc0\x12\x12", CEOS_LEADER, "name the file with the data"),
     (b"\0\0\0\1\x3f\xc0\x12\x12", "CEOS, a trailer", "name the file with the data"),
     (b"\0\0\0\1\xc0\xc0\x12\x12", "CEOS, a volume directory", "name the file with the data"),
+    (b"\1\0\0\0\x32\xc0\x12\x12", "CEOS of the other order of bytes", "fetch the original"),
     (b"CPHD/", CPHD, "name it in 'recorded_spotlight'"),
     (b"CDF", "NetCDF", f"read it with xarray, and {_NUMPY}"),
     (b"MATLAB 7.3", "a MATLAB file, 7.3", f"read it with h5py, and {_NUMPY}"),

@@ -29,6 +29,8 @@ from terrafix.models.radar.phase_history import PhaseHistory
 
 _EVEN = 1e-3
 """How far the frequencies of vectors may be from those of the first, in steps."""
+_TAPS = 8
+"""Samples on either side that one at another frequency is made of."""
 _APART = 1e-3
 """How far apart antennas that send and receive may be, relative to the range."""
 _PLACES = ("TxPos", "RcvPos", "SRPPos")
@@ -38,8 +40,8 @@ _NUMBERS = ("TxTime", "RcvTime", "FX1", "FX2", "SC0", "SCSS")
 def read_cphd(path: Path, channel: str = "") -> PhaseHistory:
     """Read a channel of phase history (CPHD, FX domain).
 
-    Places are east, north and up of the image area's reference point (IARP), on the plane that
-    touches the ellipsoid's normal there.
+    Vectors whose frequencies differ are resampled to those of the first. Places are east, north and
+    up of the image area's reference point (IARP), the ground being level there.
 
     Parameters
     ----------
@@ -53,7 +55,7 @@ def read_cphd(path: Path, channel: str = "") -> PhaseHistory:
         If sarkit is not installed.
     ValueError
         If the file is damaged, has no such channel or several and none is named, is of the TOA
-        domain, compressed, bistatic, or its vectors have frequencies that differ.
+        domain, compressed or bistatic, or its vectors have no band in common.
     """
     cphd = optional("sarkit.cphd", "phase history in CPHD", "sar")
     try:
@@ -74,8 +76,8 @@ def _history(path: Path, reader: Any, channel: str) -> PhaseHistory:
     vectors = reader.read_pvps(name)
     numbers = {key: _values(vectors, key, (n,)) for key in _NUMBERS}
     sent, received, srp = (_values(vectors, key, (n, 3)) for key in _PLACES)
-    cells = _common_band(numbers, k)
-    phase = _complex(reader.read_signal(name)[:, cells])
+    first, steps, frequency = numbers["SC0"], numbers["SCSS"], _common_band(numbers, k)
+    phase = _at(_complex(reader.read_signal(name)), first, steps, frequency)
     if "AmpSF" in vectors.dtype.names:
         phase *= _values(vectors, "AmpSF", (n,)).astype(np.float32)[:, None]
     if "SIGNAL" in vectors.dtype.names:
@@ -87,8 +89,6 @@ def _history(path: Path, reader: Any, channel: str) -> PhaseHistory:
     if (np.linalg.norm(sent - received, axis=1) > _APART * reference).any():
         raise ValueError("it was sent and received in different places (bistatic)")
     center = np.array([float(_text(tree, f"SceneCoordinates/IARP/ECF/{x}")) for x in "XYZ"])
-    step = float(numbers["SCSS"][0])
-    frequency = float(numbers["SC0"][0]) + step * np.arange(k)[cells]
     return PhaseHistory(
         *(phase, frequency, (middle - center) @ local_axes(center).T, reference),
         (numbers["TxTime"] + numbers["RcvTime"]) / 2,
@@ -137,22 +137,47 @@ def _values(vectors: NDArray[np.void], name: str, shape: tuple[int, ...]) -> Flo
     return values
 
 
-def _common_band(numbers: dict[str, FloatArray], k: int) -> slice:
-    """Samples that lie in the saved band of every vector."""
+def _common_band(numbers: dict[str, FloatArray], k: int) -> FloatArray:
+    """Frequencies of the first vector that lie in the saved band of every one [Hz]."""
     first, step = numbers["SC0"], numbers["SCSS"]
     if not (step > 0).all():
         raise ValueError("the steps between its frequencies (SCSS) are not above zero")
+    margin = 0 if _alike(first, step, k) else _TAPS
+    last = first + step * (k - 1)
+    low = max(numbers["FX1"].max(), (first + margin * step).max())
+    high = min(numbers["FX2"].min(), (last - margin * step).min())
+    cells = np.arange(k)
+    frequency = first[0] + step[0] * cells
+    slack = _EVEN * step[0]
+    common = frequency[(frequency >= low - slack) & (frequency <= high + slack)]
+    if len(common) < 2:
+        raise ValueError("no frequencies are in the band of all its vectors (FX1, FX2, SC0, SCSS)")
+    return np.asarray(common, np.float64)
+
+
+def _alike(first: FloatArray, step: FloatArray, k: int) -> bool:
     off = np.abs(first - first[0]) + k * np.abs(step - step[0])
-    if off.max() > _EVEN * step[0]:
-        raise ValueError(
-            "the frequencies of its vectors differ (SC0, SCSS): resample them to those of the first"
-        )
-    low = int(np.ceil((numbers["FX1"].max() - first[0]) / step[0] - _EVEN))
-    high = int(np.floor((numbers["FX2"].min() - first[0]) / step[0] + _EVEN))
-    cells = slice(max(low, 0), min(high, k - 1) + 1)
-    if cells.stop - cells.start < 2:
-        raise ValueError("no frequencies are in the band of all its vectors (FX1, FX2)")
-    return cells
+    return bool(off.max() <= _EVEN * step[0])
+
+
+def _at(
+    signal: ComplexArray, first: FloatArray, step: FloatArray, frequency: FloatArray
+) -> ComplexArray:
+    """Vectors at common frequencies [Hz], by their own sinc where theirs differ."""
+    n, k = signal.shape
+    start = round((frequency[0] - first[0]) / step[0])
+    if _alike(first, step, k):
+        return np.ascontiguousarray(signal[:, start : start + len(frequency)])
+    found = np.empty((n, len(frequency)), np.complex64)
+    taps = np.arange(1 - _TAPS, _TAPS + 1)
+    for i in range(n):
+        x = (frequency - first[i]) / step[i]
+        below = np.floor(x).astype(np.intp)
+        near = np.clip(below[:, None] + taps, 0, k - 1)
+        u = x[:, None] - (below[:, None] + taps)
+        weights = np.sinc(u) * np.cos(np.pi * u / (2 * _TAPS)) ** 2
+        found[i] = np.einsum("ij,ij->i", weights, signal[i][near])
+    return found
 
 
 def _complex(signal: NDArray[Any]) -> ComplexArray:

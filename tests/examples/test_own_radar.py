@@ -4,6 +4,7 @@ import os
 import re
 from pathlib import Path
 
+import ceos_files
 import numpy as np
 import pytest
 
@@ -45,9 +46,37 @@ def test_the_system_of_the_page_hears_what_its_track_predicts(system):
     assert acquired("beam_doppler") == pytest.approx(found, abs=15.0)
     assert acquired("near_range") == 847166.0
     assert acquired("time_sigma") == 0.0
+    assert recording.start == pytest.approx(float(system.nodes["orbit"].setting("start")), abs=1e-9)
+    assert recording.first_line == float(system.nodes["echo"].setting("start_line"))
     assert acquired("first_time") == pytest.approx(-0.23, abs=1e-9)
     # flat ground at 33.5 degrees off nadir, amid 847 to 868 km
     assert 857e3 < acquired("beam_range") < 860e3
+
+
+def test_the_same_in_ceos_is_the_same(system, tmp_path):
+    """The page's file as the CEOS that it was made of: orbit and attitude of the leader, its lines.
+
+    Times are cut to a millisecond: lines are 0.2 m and the boresight's Doppler 0.01 Hz elsewhere.
+    """
+    lines = ceos_files.repackaged(tmp_path, ECHO, 1400)
+    leader = tmp_path / f"LED{lines.name[6:]}"
+    nodes = system.nodes
+    nodes["orbit"].orbit_file, nodes["attitude"].result_file = leader, leader
+    nodes["echo"].folder, nodes["echo"].files = tmp_path, lines.name
+    found, original = read_recording(lines), read_recording(ECHO)
+    assert found.start == pytest.approx(original.start, abs=30e-6)
+    for name in ("carrier", "sample_rate", "chirp_rate", "pulse_length"):
+        assert getattr(found.sent, name) == pytest.approx(getattr(original.sent, name), rel=1e-8)
+    assert found.sent.prf == pytest.approx(original.sent.prf, rel=1e-6)
+    data = tf.simulate(system, members=1).dataset
+
+    def acquired(name):
+        values = data[f"echo.acquired.{name}"].values
+        return float(values[np.isfinite(values)][0])
+
+    assert acquired("beam_doppler") == pytest.approx(49.1, abs=0.1)
+    assert acquired("near_range") == 847166.0
+    assert acquired("time_sigma") == pytest.approx(0.289e-3, rel=0.01)
 
 
 def test_the_boresight_lies_off_nadir_as_the_file_says(system):

@@ -64,7 +64,7 @@ def orbit_of(record: Record) -> Ephemeris:
         for k, at in enumerate(starts)
     ]
     states = np.reshape(values, (n, 6))
-    t = step * np.arange(n)
+    t = np.asarray(step * np.arange(n), np.float64)
     tags = day + np.rint((second + t) * 1e9).astype("timedelta64[ns]")
     check_distance(states[:, :3])
     orbit = Ephemeris(tags, t, states[:, :3].copy(), states[:, 3:].copy())

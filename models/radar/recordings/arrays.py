@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import ComplexArray, FloatArray, Single, read_arrays
 from terrafix.models.radar.chirp import gain_of
-from terrafix.models.radar.recordings.lines import on_grid, places_by_number, places_by_time
+from terrafix.models.radar.recordings.lines import (
+    on_grid,
+    places_by_number,
+    places_by_time,
+    slips_among,
+)
 from terrafix.models.radar.recordings.recording import (
     WHAT,
     Recording,
@@ -64,8 +69,8 @@ def read_npz(path: Path) -> Recording:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If it is damaged, lacks an array, more than `lines.MOST_LOST` of its lines are missing,
-        lines have slipped, or it holds what is no echo.
+        If it is damaged, lacks an array, more than `lines.MOST_LOST` of its lines are missing, or
+        it holds what is no echo.
     """
     arrays = read_arrays(path, PLACE, WHAT, optional=_OPTIONAL)
     try:
@@ -75,10 +80,14 @@ def read_npz(path: Path) -> Recording:
         first = [_number(arrays[k], k) for k in PLACE]
         place, times = _places(arrays, n)
         lines = ArrayLines(parts, gain)
-        lost = lost_lines(looked_through(lines), place, _SLIPPED)
+        neighbors = looked_through(lines)
+        lost = lost_lines(neighbors, place)
     except ValueError as error:
         raise ValueError(f"'{path}' is not {WHAT}: {error}") from error
-    return Recording(path, lines, place, lost, times, first[0], first[1])
+    slips = slips_among(neighbors, place)
+    return Recording(
+        *(path, lines, place, lost, times, first[0], first[1]), slips=slips, cure=_SLIPPED
+    )
 
 
 def _places(arrays: dict[str, NDArray[Any]], n: int) -> tuple[NDArray[np.intp], FloatArray | None]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.core.formats import CEOS_DATA, CEOS_LEADER, HDF5, kind_of
@@ -74,12 +73,13 @@ class BodyAttitude:
                 f"its boresight is {found:.2f} deg off nadir to the {side}, and is said to be "
                 f"mounted at {np.degrees(look):.2f} deg"
             )
-        self._turns = Slerp(self.t, Rotation.from_quat(q_be))
+        flips = np.sign(np.einsum("ni,ni->n", q_be[1:], q_be[:-1]))
+        self._q_be: FloatArray = q_be * np.cumprod(np.append(1.0, flips))[:, None]
 
     def at(self, t: float) -> FloatArray:
         """Quaternion (4,), Earth-fixed to body, at a time since the first state of the orbit [s].
 
-        Between the file's times the body turns evenly.
+        Between the file's times the body turns evenly; its sign is continuous.
 
         Raises
         ------
@@ -91,7 +91,13 @@ class BodyAttitude:
                 f"attitude is known from {self.t[0]:.6f} s to {self.t[-1]:.6f} s after the first "
                 f"state of the orbit, and not at {t:.6f} s"
             )
-        return np.asarray(self._turns(t).as_quat(), np.float64)
+        k = min(int(np.searchsorted(self.t, t, side="right")), len(self.t) - 1)
+        one, other = self._q_be[k - 1], self._q_be[k]
+        part = (t - self.t[k - 1]) / (self.t[k] - self.t[k - 1])
+        half = np.arccos(np.clip(one @ other, -1.0, 1.0))
+        q = one * np.sinc((1 - part) * half / np.pi) * (1 - part)
+        q += other * np.sinc(part * half / np.pi) * part
+        return np.asarray(q / np.linalg.norm(q), np.float64)
 
 
 def read_body_attitude(path: Path, look: float) -> BodyAttitude:

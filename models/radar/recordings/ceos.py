@@ -27,6 +27,7 @@ References
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ from terrafix.models.geometry.quaternion import from_matrix_array
 from terrafix.models.motion.ephemeris import Ephemeris
 from terrafix.models.motion.orbits.leader import POSITIONS, POSITIONS_NAME, day_of, orbit_of
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT, gain_of
-from terrafix.models.radar.recordings.lines import places_by_number, places_by_tags
+from terrafix.models.radar.recordings.lines import places_by_number, places_by_tags, slips_among
 from terrafix.models.radar.recordings.recording import (
     IMAGE,
     WHAT,
@@ -100,7 +101,7 @@ _DAY = 86400.0
 _POINT = 120
 """Bytes of a point of attitude."""
 _RIGHT = 90.0
-_ON_SLIP = "their times do not say so: have them corrected by whoever made the file"
+_SLIPPED = "their times do not say so: have them corrected by whoever made the file"
 
 
 class ByteLines:
@@ -172,8 +173,7 @@ def read_ceos(path: Path) -> Recording:
     ------
     ValueError
         If it is of another level, damaged or truncated, a field cannot be, its leader is not
-        beside it, more than `lines.MOST_LOST` of its lines are missing, or lines have slipped and
-        their times do not tell.
+        beside it, or more than `lines.MOST_LOST` of its lines are missing.
     """
     try:
         return _recording(path)
@@ -227,13 +227,15 @@ def _recording(path: Path) -> Recording:
     first = (since.min() + since.max() + _RESOLUTION) / 2
     orbit = orbit_of(records[POSITIONS])
     return Recording(
-        *(path, lines, place, lost_lines(neighbors, place, _ON_SLIP)),
+        *(path, lines, place, lost_lines(neighbors, place)),
         line_time=first + np.arange(int(place[-1]) + 1) / sent.prf,
         first_line=int(prefix["number"][0]),
         near_range=float(ranges.min()),
         sent=sent,
         track=Track(epoch, orbit, _attitude(records, epoch, orbit)),
         time_sigma=TIME_SIGMA,
+        slips=slips_among(neighbors, place),
+        cure=_SLIPPED,
     )
 
 
@@ -267,13 +269,13 @@ def _layout(path: Path) -> tuple[np.dtype[np.void], int]:
         )
     if n < 2:
         raise ValueError("it has one line")
-    prefix = {
+    prefix: Any = {
         "names": list(_FIELDS),
         "formats": [kind for _, kind in _FIELDS.values()],
         "offsets": [at - 1 for at, _ in _FIELDS.values()],
         "itemsize": _PREFIX,
     }
-    layout = {
+    layout: Any = {
         "names": ["prefix", "samples"],
         "formats": [np.dtype(prefix), f"({n_bytes},)u1"],
         "offsets": [0, _PREFIX],
@@ -475,4 +477,4 @@ def _body_axes(r: FloatArray, v: FloatArray, angles: FloatArray) -> FloatArray:
             [cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr],
         ]
     )
-    return np.einsum("ijn,njk->nik", turned, level)
+    return np.asarray(np.einsum("ijn,njk->nik", turned, level), np.float64)

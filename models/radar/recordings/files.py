@@ -17,7 +17,7 @@ _PHASE_HISTORY = (
 )
 
 
-def read_recording(path: Path, channel: str = "") -> Recording:
+def read_recording(path: Path, channel: str = "", *, slips: bool = False) -> Recording:
     """Read recorded echo: arrays of NumPy (.npz), NISAR L0B (HDF5), or CEOS of level 1.0.
 
     Parameters
@@ -25,6 +25,9 @@ def read_recording(path: Path, channel: str = "") -> Recording:
     path : Path
     channel : str
         Which one, ``"A/HH"`` say, where a file has several.
+    slips : bool
+        Whether lines may have slipped: `Recording.slips` says where, and
+        `terrafix.models.radar.recordings.slips.without_slips` puts them right.
 
     Raises
     ------
@@ -32,8 +35,15 @@ def read_recording(path: Path, channel: str = "") -> Recording:
         If there is no such file.
     ValueError
         If it is damaged or of another kind, more than `lines.MOST_LOST` of its lines are missing,
-        lines have slipped, or it holds what is no echo; the message names the file.
+        lines have slipped and must not, or it holds what is no echo; the message names the file.
     """
+    recording = _read(path, channel)
+    if recording.slips and not slips:
+        raise ValueError(f"'{path}' is not {WHAT}: {recording.slipped()}")
+    return recording
+
+
+def _read(path: Path, channel: str) -> Recording:
     if path.is_dir():
         raise FileNotFoundError(f"'{path}' is a folder\n  name the file in it that holds the echo")
     found, cure = kind_of(path) if path.is_file() else ("", "")

@@ -72,32 +72,27 @@ class Neighbors:
         return np.asarray((alike * np.conj(total)).real / max(abs(total), 1e-30), np.float64)
 
 
-def refuse_slips(neighbors: Neighbors, place: NDArray[np.intp], cure: str) -> None:
-    """Raise ValueError where two lines are no neighbors, though those about them are.
+def slips_among(neighbors: Neighbors, place: NDArray[np.intp]) -> tuple[int, ...]:
+    """Lines, counted from 0, before which others are lost, though no place says so.
+
+    They are no neighbors of those before them, though the lines about them are each other's.
 
     Parameters
     ----------
     neighbors : Neighbors
     place : ndarray of int, shape (n,)
         Where each line belongs, counted from 0: those with others between are not compared.
-    cure : str
-        What to do about it, for the message.
     """
     from scipy.ndimage import median_filter
 
     there = neighbors.there
     pairs = np.flatnonzero(there[1:] & there[:-1] & (np.diff(place) == 1))
     if len(pairs) < _ABOUT:
-        return
+        return ()
     own = neighbors.alike[pairs]
     usual = median_filter(own, size=_ABOUT, mode="nearest")
     fallen = (own < _FALL * usual) & ((usual - own) * np.sqrt(neighbors.n_cells) > _CERTAIN)
-    if fallen.any():
-        k = int(place[pairs[np.argmax(fallen)]]) + 1
-        raise ValueError(
-            f"lines {k} and {k + 1} are no neighbors, as others are: lines between them are lost\n"
-            f"  {cure}"
-        )
+    return tuple(int(k) + 1 for k in place[pairs[fallen]])
 
 
 def places_by_number(numbers: FloatArray, name: str) -> NDArray[np.intp]:

@@ -32,7 +32,12 @@ from terrafix.models.core.hdf5 import epoch_of, has_group, opened, values_of
 from terrafix.models.geometry.quaternion import from_scalar_first
 from terrafix.models.motion.orbits.hdf5 import orbit_of
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT, gain_of
-from terrafix.models.radar.recordings.lines import on_grid, places_by_number, places_by_time
+from terrafix.models.radar.recordings.lines import (
+    on_grid,
+    places_by_number,
+    places_by_time,
+    slips_among,
+)
 from terrafix.models.radar.recordings.recording import (
     FORMATS,
     IMAGE,
@@ -52,7 +57,7 @@ _TOLD = 6
 """Names of what a file of another kind holds that are told."""
 _N_CODES = 65536
 _MOST_COMPRESSED = 300
-"""Samples of echo in a byte at most: zlib makes a thousandth of zeros, which are four bytes each."""
+"""Samples of echo in a byte at most: zlib makes a thousandth of zeros, four bytes each."""
 _EVEN = 1e-4
 """How far ranges may be from even spacing, in cells."""
 _UNIT = 1e-3
@@ -117,8 +122,7 @@ def read_l0b(path: Path, channel: str = "") -> Recording:
     ------
     ValueError
         If it is damaged, no such file, lacks a part or has one that cannot be, has no such channel
-        or several and none is named, more than `lines.MOST_LOST` of its lines are missing, or lines
-        have slipped.
+        or several and none is named, or more than `lines.MOST_LOST` of its lines are missing.
     """
     try:
         with opened(path) as file:
@@ -184,18 +188,14 @@ def _recording(path: Path, file: Any, channel: str) -> Recording:
     lines = CodeLines(
         *(path, samples, shape, _table(rx, file[samples]), _valid(tx, n), _gain(rx, n))
     )
+    neighbors = looked_through(lines)
     return Recording(
-        *(
-            path,
-            lines,
-            place,
-            lost_lines(looked_through(lines), place, _SLIPPED),
-            line_time,
-            first_line,
-        ),
+        *(path, lines, place, lost_lines(neighbors, place), line_time, first_line),
         near_range=float(ranges[0]),
         sent=sent,
         track=_track(file[root], epoch),
+        slips=slips_among(neighbors, place),
+        cure=_SLIPPED,
     )
 
 

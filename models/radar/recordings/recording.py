@@ -7,7 +7,7 @@ some were lost, those about them stay where they were received, and zeros lie be
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -20,7 +20,6 @@ from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.recordings.lines import (
     MOST_LOST,
     Neighbors,
-    refuse_slips,
     too_many_lost,
 )
 
@@ -30,7 +29,7 @@ FORMATS = (
     "first_rg_cell, or NISAR L0B (HDF5)"
 )
 IMAGE = "an image, formed already: name the raw echo (level 0) that it was formed of"
-_MOVED = 0.07
+_MOVED = 0.08
 """Lines that an image is moved by where 3 to 10 lines of its aperture are zeros, rms: measured by
 benchmarks/lost_lines.py."""
 _BLOCK = 2**22
@@ -136,6 +135,11 @@ class Recording:
     track : Track, optional
     time_sigma : float
         Standard error that the times of all its lines have in common [s].
+    slips : sequence of int
+        Lines, counted from 0, before which others are lost without a number or a time that says so:
+        from there on lines are too early (`terrafix.models.radar.recordings.slips`).
+    cure : str
+        What can be done about slips, for messages.
     """
 
     path: Path
@@ -149,6 +153,8 @@ class Recording:
     sent: Sent | None = None
     track: Track | None = None
     time_sigma: float = 0.0
+    slips: tuple[int, ...] = ()
+    cure: str = ""
 
     @property
     def n_lines(self) -> int:
@@ -183,10 +189,26 @@ class Recording:
         ValueError
             If the recording has no orbit or no times, or they do not meet.
         """
+        orbit, times = self._located()
+        return orbit.at(times)
+
+    @property
+    def start(self) -> float:
+        """When its first line was sent, after the first state of its orbit [s].
+
+        Raises
+        ------
+        ValueError
+            If the recording has no orbit or no times.
+        """
+        return float(self._located()[1][0])
+
+    def _located(self) -> tuple[Ephemeris, FloatArray]:
+        """Orbit, and times of lines after its first state [s]."""
         if self.track is None or self.track.orbit is None or self.line_time is None:
             raise ValueError(f"'{self.path}' has no orbit, or no times of its lines")
         orbit = self.track.orbit
-        return orbit.at(self.line_time + seconds(self.track.epoch - orbit.tags[0]))
+        return orbit, self.line_time + seconds(self.track.epoch - orbit.tags[0])
 
     def error_of_times(self, prf: float) -> float:
         """Standard error of the times of what an image of it shows [s].
@@ -199,6 +221,38 @@ class Recording:
             Pulse repetition frequency [Hz].
         """
         return float(np.hypot(self.time_sigma, (_MOVED / prf) if len(self.lost) else 0.0))
+
+    def with_lost(self, line: int, n_lost: int) -> Recording:
+        """The same with lines that are lost before a line, counted from 0; it and others move on.
+
+        Raises
+        ------
+        ValueError
+            If too many are lost.
+        """
+        place = np.where(self.place >= line, self.place + n_lost, self.place)
+        lost = np.where(self.lost > line, self.lost + n_lost, self.lost)
+        lost = np.sort(np.append(lost, line + 1 + np.arange(n_lost)))
+        n = int(place[-1]) + 1
+        if len(lost) > MOST_LOST * n:
+            raise too_many_lost(len(lost), n, int(lost[0]))
+        times = self.line_time
+        if times is not None:
+            step = float(np.median(np.diff(times)))
+            gap = times[line - 1] + step * np.arange(1, n_lost + 1)
+            times = np.concatenate([times[:line], gap, times[line:] + n_lost * step])
+        slips = tuple(k + n_lost if k > line else k for k in self.slips if k != line)
+        return replace(self, place=place, lost=lost, line_time=times, slips=slips)
+
+    def slipped(self) -> str:
+        """Where lines slipped, and what can be done about it; empty if none did."""
+        if not self.slips:
+            return ""
+        k = self.slips[0]
+        return (
+            f"lines {k} and {k + 1} are no neighbors, as others are: lines between them are lost"
+            f"\n  {self.cure}"
+        )
 
     def told(self) -> str:
         """What was lost, for messages; empty if nothing was."""
@@ -234,7 +288,7 @@ def looked_through(lines: Lines) -> Neighbors:
     return neighbors
 
 
-def lost_lines(neighbors: Neighbors, place: NDArray[np.intp], cure: str) -> NDArray[np.intp]:
+def lost_lines(neighbors: Neighbors, place: NDArray[np.intp]) -> NDArray[np.intp]:
     """Numbers of the lost ones of lines that were looked through, counted from 1.
 
     Parameters
@@ -242,20 +296,17 @@ def lost_lines(neighbors: Neighbors, place: NDArray[np.intp], cure: str) -> NDAr
     neighbors : Neighbors
     place : ndarray of int, shape (n,)
         Line of the recording that each of them is, counted from 0.
-    cure : str
-        What to do about lines that slipped, for the message.
 
     Raises
     ------
     ValueError
-        If more than `MOST_LOST` of them are missing, or lines have slipped.
+        If more than `MOST_LOST` of them are missing.
     """
     there = np.zeros(int(place[-1]) + 1, np.bool_)
     there[place] = neighbors.there
     n_lost = int(np.sum(~there))
     if n_lost > MOST_LOST * len(there):
         raise too_many_lost(n_lost, len(there), int(np.argmin(there)) + 1)
-    refuse_slips(neighbors, place, cure)
     return np.flatnonzero(~there) + 1
 
 

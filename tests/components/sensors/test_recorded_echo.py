@@ -1,14 +1,25 @@
 """Recorded echo as a component: the radar is that of the files, or of the settings, never both."""
 
+import os
+from pathlib import Path
+
+import ceos_files
 import numpy as np
 import pytest
 from l0b_files import NEAR, PRF, beam, codes, write
 
 from terrafix.components.sensors.echo import RecordedEcho
+from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Environment
+from terrafix.cosim.engine.run import RunError, simulate
+from terrafix.cosim.files.readers import read_system
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT
 
+ROOT = Path(__file__).parents[3]
+DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT / ".." / "shared" / "data"))
+REAL = ROOT / "examples" / "spacecraft_sar_real_echo.toml"
+TRUTH = {"orbit", "attitude", "antenna", "terrain", "echo"}
 N, CELLS = 400, 256
 WHERE = {"look": 0.6, "doppler_bandwidth": 1500.0}
 SENT = {
@@ -107,8 +118,8 @@ def test_lines_are_published_when_and_where_they_were_received(
     monkeypatch.setattr(component, "_publish", lambda *args, **more: sent.append((*args, more)))
     component.step(0.1, 0.1)
     t, echo, first_time, first_range, more = sent[0]
-    # 0.07 lines rms are what zeros in the place of lost lines move an image by
-    expected = 0.07 / PRF if files == "b.h5" else 0.0
+    # 0.08 lines rms are what zeros in the place of lost lines move an image by
+    expected = 0.08 / PRF if files == "b.h5" else 0.0
     assert more["time_sigma"] == pytest.approx(expected, rel=1e-9)
     assert t == 0.1
     assert first_time == pytest.approx(20 / PRF, abs=1e-9)
@@ -118,6 +129,67 @@ def test_lines_are_published_when_and_where_they_were_received(
     component.step_index = 0
     with pytest.raises(ConfigurationError, match="its lines were received from"):
         component.step(1.0, 1.0)
+
+
+def test_ceos_says_what_its_times_leave_open(tmp_path, monkeypatch):
+    """Radar and near range of its leader and lines; half a millisecond of its times is open."""
+    ceos_files.leader(tmp_path)
+    path = ceos_files.write(tmp_path, ceos_files.coded(beam(N, 160) / 2))
+    component = radar(tmp_path, path.name, start_line=7.0)
+    component.validate()
+    assert component._radar().chirp_rate == pytest.approx(-14e6 / 8e-6)
+    members = np.arange(1)
+    component.bind(Environment("echo", 0, members, members >= 0, lambda *_: None, False))
+    sent = []
+    monkeypatch.setattr(component, "_publish", lambda *args, **more: sent.append((*args, more)))
+    component.step(0.1, 0.1)
+    t, echo, first_time, near, more = sent[0]
+    assert (t, echo.shape, first_time, near) == (0.1, (N, 160), 0.0, NEAR)
+    assert more["time_sigma"] == pytest.approx(1e-3 / np.sqrt(12))
+
+
+def heard(tmp_path, path, torn):
+    """A part of the real-echo system: what its radar publishes at 6.09 s, of lines that slipped."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    for name in ("i", "q", "agc_db"):
+        arrays[name] = np.delete(arrays[name], torn, axis=0)
+    np.savez(tmp_path / "torn.npz", **arrays)
+    system = read_system(REAL)
+    for name in [n for n in system.nodes if n not in TRUTH]:
+        system.remove(name)
+    system.records.clear()
+    for name in ("orbit", "attitude", "antenna"):
+        system.nodes[name].rate = Rate(hz=10)
+    system.nodes["echo"].folder = tmp_path
+    system.nodes["echo"].files = "torn.npz"
+    system.nodes["echo"].rate = Rate(times=["6.09"])
+    system.record("heard", ["echo.acquired"])
+    return simulate(system, members=1, duration="6.1 s").dataset
+
+
+def test_lines_that_slipped_are_put_where_they_belong(tmp_path, caplog):
+    """Ten lines of RADARSAT-1 over Stanley Park: told, and weighed by what zeros do to an image."""
+    path = DATA / "radarsat1_vancouver" / "stanley_park.npz"
+    if not path.is_file():
+        pytest.skip(f"no {path}")
+    data = heard(tmp_path, path, np.s_[900:910])
+    assert "10 of its 1536 lines are lost, the first is line 901" in caplog.text
+    sigma = data["echo.acquired.time_sigma"].to_numpy()
+    assert sigma[np.isfinite(sigma)] == pytest.approx(0.08 / 1256.98)
+
+
+def test_a_slip_that_the_echo_does_not_tell_is_refused(tmp_path):
+    """Over water: the message says where, why, and what can be done about it."""
+    path = DATA / "radarsat1_vancouver" / "english_bay_1.npz"
+    if not path.is_file():
+        pytest.skip(f"no {path}")
+    with pytest.raises((ConfigurationError, RunError), match="cannot use") as raised:
+        heard(tmp_path, path, np.s_[640:650])
+    text = str(raised.value)
+    assert "lines 640 and 641 are no neighbors" in text
+    assert "line_number" in text
+    assert "before line 641 is not told: what is seen before and after it is not alike" in text
 
 
 def test_a_channel_is_named_where_there_are_several(tmp_path):

@@ -71,6 +71,21 @@ def test_the_common_band_is_read(tmp_path):
     np.testing.assert_allclose(history.frequency, FREQUENCY[3:191])
 
 
+def test_vectors_of_other_frequencies_are_resampled(tmp_path, aircraft):
+    """As those of a radar that follows its scene: by 9 MHz in all, and steps by a thousandth.
+
+    Phases are those at the common frequencies to 2e-3, what 16 samples make of sinc.
+    """
+    other = {"SC0": FREQUENCY[0] + 1e5 * np.arange(96), "SCSS": 1.5e6 + 16.0 * np.arange(96)}
+    history = read_phase_history([written(tmp_path / "a.cphd", **other)])
+    assert FREQUENCY[0] + 9e6 < history.frequency[0] < FREQUENCY[0] + 30e6
+    alike = read_phase_history([written(tmp_path / "b.cphd")])
+    cells = np.searchsorted(alike.frequency, history.frequency - 1.0)
+    np.testing.assert_allclose(history.phase, alike.phase[:, cells], atol=4e-3)
+    place = found_near(history, LOCAL[1] + np.array([0.2, -0.3, 0.0]), aircraft.SUMS)
+    assert np.linalg.norm(place - LOCAL[1]) < 0.05
+
+
 def test_a_channel_is_named_where_there_are_several(tmp_path):
     path = written(tmp_path / "a.cphd", names=("HH", "HV"))
     with pytest.raises(ValueError, match="several channels: HH, HV\n  name one"):
@@ -84,7 +99,7 @@ def test_a_channel_is_named_where_there_are_several(tmp_path):
     ("change", "told"),
     [
         ({"domain": "TOA"}, "in the domain 'TOA': transform its vectors to FX"),
-        ({"SC0": FREQUENCY[0] + 1e5 * np.arange(96)}, r"frequencies of its vectors differ"),
+        ({"SC0": FREQUENCY[0] + 1e7 * np.arange(96)}, "no frequencies are in the band of all"),
         ({"SCSS": -1.5e6}, "are not above zero"),
         ({"FX1": FREQUENCY[-1]}, "no frequencies are in the band of all"),
         ({"SRPPos": np.nan}, "'SRPPos' of its vectors is not finite"),

@@ -9,6 +9,9 @@ import struct
 import numpy as np
 from l0b_files import NEAR, PRF, circular
 
+from terrafix.models.core.hdf5 import opened
+from terrafix.models.radar.recordings.files import read_recording
+
 DAY = "2011-01-13"
 BIAS = 15.5
 T0 = 9000.0
@@ -50,6 +53,7 @@ def line(k, samples, length, *, number, millisecond, near=NEAR, year=2011, day=1
         "scan": 0,
         "compressed": 0,
         "gain": 0,
+        "chirp_length": PULSE,
         "nought": 0,
     }
     said |= change
@@ -59,7 +63,7 @@ def line(k, samples, length, *, number, millisecond, near=NEAR, year=2011, day=1
         ">9i", number, 0, said["left"], pixels, said["right"], 0, year, day, millisecond
     )
     prefix += struct.pack(">4h2i2h", 1, 0, 0, 0, said["prf"], said["scan"], said["compressed"], 0)
-    prefix += struct.pack(">4i8x", PULSE, 0, 0, 0)
+    prefix += struct.pack(">4i8x", said["chirp_length"], 0, 0, 0)
     prefix += struct.pack(">8i4x", said["gain"], said["nought"], 0, 0, 0, 0, round(near), 0)
     prefix += bytes(412 - len(prefix))
     return (prefix + bytes(samples)).ljust(length, b"\0")
@@ -155,6 +159,35 @@ def write(
         parts.append(line(k, samples[k], length, **(told | said)))
     (folder / name).write_bytes(b"".join(parts))
     return folder / name
+
+
+def repackaged(folder, path, n_cells):
+    """ALOS PALSAR's HDF5 (NISAR L0B), which ISCE3 made of CEOS, put back into it, of some cells."""
+    original = read_recording(path)
+    low = "science/LSAR/RRSD/lowRateTelemetry"
+    with opened(path) as file:
+        angles = file[f"{low}/attitude/eulerAngles"][...]
+        at = file[f"{low}/attitude/time"][...]
+        tx = file["science/LSAR/RRSD/swaths/frequencyA/txH"]
+        received = tx["radarTime"][...] + 2 * original.near_range / C
+        bandwidth, prf = (float(tx[k][...]) for k in ("rangeBandwidth", "nominalAcquisitionPRF"))
+    orbit = original.track.orbit
+    t = (orbit.tags - original.track.epoch).astype(np.int64) / 1e9
+    leader(
+        folder,
+        summary=summary(wavelength=C / original.sent.carrier),
+        positions=positions(t, orbit.r_e, orbit.v_e),
+        attitudes=attitudes(at, angles),
+        calibration=calibration(bandwidth / 1e6),
+    )
+    return write(
+        *(folder, coded(original.read()[:, :n_cells])),
+        rate=prf,
+        millisecond=lambda k: round(1e3 * received[k]),
+        number=lambda k: original.first_line + k,
+        near=lambda k: original.near_range,
+        chirp_length=lambda k: round(1e9 * original.sent.pulse_length),
+    )
 
 
 def coded(echo):

@@ -48,13 +48,17 @@ def write(
 ):
     """Write the echo of unit points (m, 3), seen from a track (n, 3) of places, Earth-fixed.
 
-    Each pulse is sent before and received after the antenna is at its place, by half the delay.
+    Each pulse is sent before and received after the antenna is at its place, by half the delay;
+    frequencies are those of its own SC0 and SCSS.
     """
     form = change.pop("form", "CF8")
+    first, step = change.get("SC0", frequency[0]), change.get("SCSS", np.diff(frequency)[0])
     n, k = len(track), len(frequency)
     t = 1e-3 * np.arange(n)
     velocity = np.gradient(track, t, axis=0)
     srp = np.broadcast_to(change.pop("srp", center), (n, 3))
+    ramp = np.arange(k) * np.broadcast_to(step, n)[:, None]
+    own = np.broadcast_to(first, n)[:, None] + ramp
     half = np.linalg.norm(track - srp, axis=1)[:, None] / C
     sent, received = track - half * velocity, track + half * velocity
 
@@ -63,7 +67,7 @@ def write(
 
     phase = np.zeros((n, k), complex)
     for p in points:
-        phase += np.exp(2j * np.pi * sign * np.outer(delay(p) - delay(srp), frequency))
+        phase += np.exp(2j * np.pi * sign * (delay(p) - delay(srp))[:, None] * own)
     amplitude = change.get("AmpSF")
     meta = metadata(
         *(n, k),
@@ -81,8 +85,8 @@ def write(
         "TxPos": sent,
         "RcvPos": received,
     }
-    values |= {"SRPPos": srp, "FX1": frequency[0], "FX2": frequency[-1], "SC0": frequency[0]}
-    values |= {"SCSS": frequency[1] - frequency[0], **change}
+    values |= {"SRPPos": srp, "FX1": own[:, 0], "FX2": own[:, -1], "SC0": first, "SCSS": step}
+    values |= change
     for name, value in values.items():
         vectors[name] = value
     if amplitude is not None:

@@ -6,7 +6,6 @@ import pytest
 from ceos_files import BIAS, LOOK, T0, coded, leader, write
 from l0b_files import NEAR, PRF, beam, circular
 
-from terrafix.models.core.hdf5 import opened
 from terrafix.models.geometry.quaternion import rotation_matrix_array
 from terrafix.models.motion.orbits.files import read_orbit
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT
@@ -74,31 +73,8 @@ def test_angles_of_palsars_scene_give_the_quaternions_that_isce3_wrote(tmp_path,
     path = data_folder / "alos_palsar" / ALOS
     if not path.is_file():
         pytest.skip(f"no {path}")
-    original = read_recording(path)
-    low = "science/LSAR/RRSD/lowRateTelemetry"
-    with opened(path) as file:
-        angles = file[f"{low}/attitude/eulerAngles"][...]
-        at = file[f"{low}/attitude/time"][...]
-        tx = file["science/LSAR/RRSD/swaths/frequencyA/txH"]
-        received = tx["radarTime"][...] + 2 * original.near_range / SPEED_OF_LIGHT
-        bandwidth = float(tx["rangeBandwidth"][...])
-    orbit = original.track.orbit
-    t = (orbit.tags - original.track.epoch).astype(np.int64) / 1e9
-    leader(
-        tmp_path,
-        summary=ceos.summary(wavelength=SPEED_OF_LIGHT / original.sent.carrier),
-        positions=ceos.positions(t, orbit.r_e, orbit.v_e),
-        attitudes=ceos.attitudes(at, angles),
-        calibration=ceos.calibration(bandwidth / 1e6),
-    )
-    n = 1000
-    said = {
-        "millisecond": lambda k: round(1e3 * received[k]),
-        "number": lambda k: 4001 + k,
-        "near": lambda k: original.near_range,
-    }
-    lines = coded(original.read(0, n)[:, :400])
-    made = read_recording(write(tmp_path, lines, rate=2150.538, **said))
+    original, n = read_recording(path), 1000
+    made = read_recording(ceos.repackaged(tmp_path, path, 400))
     np.testing.assert_array_equal(made.read(), original.read(0, n)[:, :400])
     assert made.first_line == original.first_line
     np.testing.assert_allclose(made.line_time, original.line_time[:n], atol=30e-6)
