@@ -18,6 +18,8 @@ from terrafix.models.maps.raster import LARGEST, SUFFIXES, Raster, knots, open_r
 
 _CLOSE = 0.02
 """How exactly places of a grid are known in pixels of a raster."""
+_STRIP = 128
+"""Rows of a grid that are interpolated at a time."""
 _MERIDIAN = 6371e3
 _NEAR_POLE = np.radians(89.9)
 
@@ -118,14 +120,18 @@ def _resampled(raster: Raster, latitude: FloatArray, longitude: FloatArray) -> D
     values = _known(raster, rows, columns)
     at = knots(raster.pixels, (south, north), (west, east), np.full(2, _CLOSE))[2]
     u, w = (np.linspace(0, len(at) - 1, n) for n in (n_lat, n_lon))
-    places = np.meshgrid(u, w, indexing="ij")
-    row, column = (
-        map_coordinates(at[..., k], places, order=1, mode="nearest") - first
-        for k, first in ((0, rows.start), (1, columns.start))
-    )
-    height = map_coordinates(values, [row, column], order=1, mode="constant", cval=np.nan)
+    height = np.empty((n_lat, n_lon), np.float32)
+    for first in range(0, n_lat, _STRIP):
+        places = np.meshgrid(u[first : first + _STRIP], w, indexing="ij")
+        pixel = [
+            map_coordinates(at[..., k], places, order=1, mode="nearest") - start
+            for k, start in ((0, rows.start), (1, columns.start))
+        ]
+        height[first : first + _STRIP] = map_coordinates(
+            values, pixel, order=1, mode="constant", cval=np.nan
+        )
     step = (north - south) / (n_lat - 1), (east - west) / (n_lon - 1)
-    return _dem(raster, height.astype(np.float32), south, west, *step)
+    return _dem(raster, height, south, west, *step)
 
 
 def _known(raster: Raster, rows: slice, columns: slice) -> Single:
