@@ -21,7 +21,7 @@ from terrafix.models.images.reference import Reference
 from terrafix.models.maps.elevation import square_about
 from terrafix.models.maps.raster import LARGEST, Raster, knots
 from terrafix.models.maps.sentinel1 import Sentinel1
-from terrafix.models.radar.multilook import detected, full_index
+from terrafix.models.radar.multilook import detected, full_index, multilook_index
 
 CLOSE = 0.02
 """How exactly places between tie points are known [pixels]."""
@@ -91,7 +91,7 @@ class RasterMap:
             )
         at = raster.pixels(*_samples(lat, lon))
         pixels = [
-            np.floor((a - part.start) / step + 1e-9)
+            np.rint(multilook_index(a - part.start, step))
             for a, part in zip(at, (rows, columns), strict=True)
         ]
         _require_seen(raster.path.name, known & (amplitude > 0), *pixels)
@@ -140,7 +140,7 @@ class Sentinel1Map:
         place = _samples(lat, lon)
         at = image.pixels(ecef(*place, terrain(*place)))
         pixels = [
-            np.floor((a - part.start) / n + 1e-9)
+            np.rint(multilook_index(a - part.start, n))
             for a, part, n in zip(at, (lines, samples), looks, strict=True)
         ]
         _require_seen(image.path.name, amplitude > 0, *pixels)

@@ -37,7 +37,9 @@ def read_elevations(path: Path) -> Dem:
         If it cannot be read, is too large, or holds what is no height of the Earth.
     """
     if path.suffix.lower() not in SUFFIXES:
-        return read_dem(path)
+        dem = read_dem(path)
+        _require_heights(dem, path)
+        return dem
     raster = open_raster(path)
     n = raster.shape[0] * raster.shape[1]
     if n > LARGEST:
@@ -48,7 +50,7 @@ def read_elevations(path: Path) -> Dem:
         )
     if raster.north_up:
         return _cut(raster, slice(0, raster.shape[0]), slice(0, raster.shape[1]))
-    rows, columns = (np.array([0.0, (k - 1) / 2, k - 1.0]) for k in raster.shape)
+    rows, columns = (np.linspace(0, k - 1, 9) for k in raster.shape)
     latitude, longitude = raster.places(rows[:, None], columns[None, :])
     return _resampled(raster, latitude, longitude)
 
@@ -145,6 +147,10 @@ def _dem(
     raster: Raster, height: Single, south: float, west: float, north_step: float, east_step: float
 ) -> Dem:
     dem = Dem(height, south, west, north_step, east_step, raster.path.name)
-    if dem.n_void == height.size:
-        raise ValueError(f"'{raster.path}' holds nothing but voids where it is read")
+    _require_heights(dem, raster.path)
     return replace(dem, datum=raster.vertical, sigma=raster.vertical_sigma)
+
+
+def _require_heights(dem: Dem, path: Path) -> None:
+    if dem.n_void == dem.height.size:
+        raise ValueError(f"'{path}' holds nothing but voids where it is read")
