@@ -112,8 +112,8 @@ def test_a_file_that_does_not_say_what_its_heights_refer_to_is_refused_unless_it
     with pytest.raises(SystemCheckError, match=r"(?s)does not say .* set terrain\.vertical_datum"):
         heights(dem_file=path)
     assert (heights(dem_file=path, vertical_datum="ellipsoid") == 5).all()
-    with pytest.raises(SystemCheckError, match="does not take 'geoid'"):
-        heights(dem_file=path, vertical_datum="ellipsoid", geoid="degree 70")
+    assert not Terrain(dem_file=path, vertical_datum="ellipsoid").takes("geoid")
+    assert Terrain(dem_file=path).takes("geoid")
 
 
 def test_a_tile_of_voids_is_refused(tmp_path):
