@@ -130,7 +130,7 @@ def places() -> None:
                 dataset.write(np.ones((n, n), np.uint8), 1)
             raster = open_raster(path)
             at = np.radians(latitude), np.radians(longitude)
-            reference = RasterMap(raster).about(*at, 2000.0, 0.0, flat_dem(0.0).at)
+            reference = RasterMap(raster).about(*at, 2000.0, 0.0, flat_dem(0.0).at).reference()
             row, column = (rng.uniform(0, k - 1, 2000) for k in reference.amplitude.shape)
             latitudes, longitudes, _ = reference.place(row, column)
             i, j = raster.pixels(latitudes, longitudes)

@@ -106,7 +106,7 @@ def run(part, members=1, **options):
 
 
 def reference_map(path, **settings):
-    settings = {"look": LOOK, "reach": 2000.0} | settings
+    settings = {"look": LOOK, "reach": 2000.0, "geometry": "map"} | settings
     return ReferenceMap(map_file=path, rate=tf.Rate(times=["1"]), **settings)
 
 

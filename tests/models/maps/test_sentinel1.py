@@ -81,7 +81,7 @@ def test_a_part_of_it_becomes_a_reference_of_square_pixels(real):
     r, v = real.orbit.at(real.seen_at(9064, 11_700)[0])
     p = ground_point(r, v, real.seen_at(9064, 11_700)[1], 0.0)
     latitude, longitude, _ = (float(a) for a in geodetic(p))
-    reference = Sentinel1Map(real).about(latitude, longitude, 1700.0, 0.0, FLAT)
+    reference = Sentinel1Map(real).about(latitude, longitude, 1700.0, 0.0, FLAT).reference()
     # 13.9 m along the track, four samples of 2.33 m over the sine of incidence across it
     assert reference.amplitude.shape == pytest.approx((298, 295), abs=3)
     row, column, inside = reference.pixel(latitude, longitude)
