@@ -18,7 +18,7 @@ from terrafix.components.truth.terrain import Terrain, referred
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Component
-from terrafix.cosim.declare.parameters import Choice, Count, FilePath, OptionalFilePath, Parameter
+from terrafix.cosim.declare.parameters import Count, FilePath, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import Input, SharedInput, SharedOutput
 from terrafix.models.geometry.geodesy import geodetic
 from terrafix.models.images.mapped import Beam, Map, RasterMap, Sentinel1Map, as_seen
@@ -33,7 +33,6 @@ _ROUNDS, _CLOSE = 20, 1.0
 """Of the search for the ground's height under the boresight, and how close it comes [m]."""
 _DIAGONAL = 1.5
 """Of a square that is turned, and spare."""
-GEOMETRIES = ("slant", "map")
 _OF_ANNOTATION = ("first_line", "first_sample")
 Height = Callable[[float, float], float]
 
@@ -75,9 +74,10 @@ class InView(Component):
 class ReferenceMap(InView, ReferenceSource):
     """Reference that is a part of a map: a GeoTIFF of amplitudes, or an image of Sentinel-1.
 
-    It is drawn as the radar will see it: on relief a map and an image differ by more than a shift.
-    Heights are those of the terrain, which has to cover it: a square that is turned takes half as
-    much again as `reach`. What the map does not know is not matched.
+    It is drawn as the radar will see it: on relief a map and an image differ by more than a shift,
+    and what is matched all the same is tens of meters off. Heights are those of the terrain, which
+    has to cover it: a square that is turned takes half as much again as `reach`. What the map does
+    not know is not matched.
     """
 
     map_file = FilePath(doc="GeoTIFF of one band, any system, turned or not; .tiff of Sentinel-1")
@@ -86,9 +86,6 @@ class ReferenceMap(InView, ReferenceSource):
     first_sample = Count(0, doc="sample with which it begins")
     spacing = Parameter(
         0.0, unit="m", minimum=0.0, doc="of the image's pixels: finer ones are averaged; 0: as is"
-    )
-    geometry = Choice(
-        GEOMETRIES, GEOMETRIES[0], doc="slant: as the radar will see it; map: as the map is"
     )
 
     height = SharedInput(**HEIGHT, doc="heights of the terrain, as they are known")
@@ -125,11 +122,8 @@ class ReferenceMap(InView, ReferenceSource):
         source = self._map()
         try:
             beam, *place = self._beam(lambda *at: float(dem.known_at(*at)))
-            if self.geometry == "map":
-                reference = source.about(*place, reach, spacing, dem.at).reference()
-            else:
-                part = source.about(*place, _DIAGONAL * reach, spacing, dem.at)
-                reference = as_seen(part, beam, reach, spacing, dem.at)
+            part = source.about(*place, _DIAGONAL * reach, spacing, dem.at)
+            reference = as_seen(part, beam, reach, spacing, dem.at)
         except ValueError as error:
             raise ConfigurationError(
                 f"'{self.name}' has no reference where the beam looks: {error}"

@@ -114,6 +114,8 @@ def test_of_a_map_of_10000_by_10000_only_a_part_is_taken(tmp_path):
         window = rasterio.windows.Window(4096, 4096, 1536, 1536)
         dataset.write(np.ones((1536, 1536), np.float32), 1, window=window)
     place = np.radians(36.0), np.radians(-84.0)
-    reference = RasterMap(open_raster(tmp_path / "m.tif")).about(*place, 1500.0, 10.0, FLAT).reference()
+    reference = (
+        RasterMap(open_raster(tmp_path / "m.tif")).about(*place, 1500.0, 10.0, FLAT).reference()
+    )
     assert reference.amplitude.shape == pytest.approx((429, 429), abs=12)
     assert (reference.amplitude > 0).mean() > 0.9
