@@ -26,17 +26,22 @@ import rasterio
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from terrafix.models.images.mapped import RasterMap
+from terrafix.models.images.mapped import Beam, RasterMap, as_seen
 from terrafix.models.maps.dem import Dem, flat_dem
 from terrafix.models.maps.elevation import elevations_about
 from terrafix.models.maps.geoid import harmonic_undulation, on_ellipsoid, undulation_of
 from terrafix.models.maps.raster import open_raster
 from terrafix.models.maps.sentinel1 import read_sentinel1
+from terrafix.models.motion.attitude import lvlh_quaternion_array
+from terrafix.models.radar.boresight import boresight_on_terrain
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT / ".." / "shared" / "data"))
 PLACE = np.radians(29.76), np.radians(-95.37)
 UTM = "EPSG:32615"
+R_E = np.array([-1104646.3, -6096830.4, 3395727.4])
+V_E = np.array([-1004.7, 3648.9, 6498.0])
+"""Of a pass that sees the place 34.3 degrees to its right [m], [m/s]."""
 REACH = 5400.0
 TILE = 512
 
@@ -88,7 +93,12 @@ def part(kind: str, path: Path) -> None:
         shape = elevations_about(raster, *PLACE, REACH).height.shape
     else:
         spacing = 0.0 if kind == "reference" else 12.0
-        shape = RasterMap(raster).about(*PLACE, REACH, spacing, flat).amplitude.shape
+        look, aligned = np.radians(34.3), np.array([0.0, 0.0, 0.0, 1.0])
+        q_be = lvlh_quaternion_array(R_E, V_E)
+        point = boresight_on_terrain(R_E, V_E, q_be, aligned, look, 0.0, flat_dem(0.0)).point
+        wide = RasterMap(raster).about(*PLACE, 1.45 * REACH, spacing, flat)
+        beam = Beam(R_E, V_E, point)
+        shape = as_seen(wide, beam, REACH, spacing, flat).amplitude.shape
     own, parts = time.process_time() - start, raster.shape[0] * raster.shape[1]
     print(
         f"{kind:22s} {shape[0]:6d} x {shape[1]:<6d} of {parts / 1e6:4.0f} Mpx: "

@@ -31,7 +31,7 @@ from terrafix.models.radar.boresight import boresight_on_terrain
 _ALIGNED = np.array([0.0, 0.0, 0.0, 1.0])
 _ROUNDS, _CLOSE = 20, 1.0
 """Of the search for the ground's height under the boresight, and how close it comes [m]."""
-_DIAGONAL = 1.5
+_DIAGONAL = 1.45
 """Of a square that is turned, and spare."""
 _OF_ANNOTATION = ("first_line", "first_sample")
 Height = Callable[[float, float], float]

@@ -50,6 +50,10 @@ _SEEN_TIES = 4
 """The same, of what is drawn."""
 _RELIEF, _ROUNDS, _LEVEL = 300.0, 40, 0.05
 """Heights beyond those found at first, rounds of the search for them, how close it comes [m]."""
+_STRIP = 256
+"""Rows drawn at a time."""
+_LONGEST = 32_000
+"""Rows or columns that OpenCV's maps reach."""
 _MERIDIAN = 6371e3
 
 
@@ -231,11 +235,16 @@ def _drawn(image: Single, ties: FloatArray, row: FloatArray, column: FloatArray)
     """What an image shows at rows and columns given at tie points, bilinear; zero if not known."""
     n = round(float(ties[-1])) + 1
     at = np.interp(np.arange(n), ties, np.arange(len(ties))).astype(np.float32)
-    j, i = np.meshgrid(at, at)
-    x, y = (cv2.remap(a.astype(np.float32), j, i, cv2.INTER_LINEAR) for a in (column, row))
-    known = cv2.remap((image > 0).astype(np.float32), x, y, cv2.INTER_LINEAR)
-    found = cv2.remap(image, x, y, cv2.INTER_LINEAR)
-    return np.where(known > 1 - 1e-3, found, 0).astype(np.float32)
+    coarse = [a.astype(np.float32) for a in (column, row)]
+    known = np.where(image > 0, np.uint8(255), np.uint8(0))
+    out = np.empty((n, n), np.float32)
+    for first in range(0, n, _STRIP):
+        j, i = np.meshgrid(at, at[first : first + _STRIP])
+        x, y = (cv2.remap(a, j, i, cv2.INTER_LINEAR) for a in coarse)
+        part = cv2.remap(image, x, y, cv2.INTER_LINEAR)
+        part[cv2.remap(known, x, y, cv2.INTER_LINEAR) < 255] = 0
+        out[first : first + _STRIP] = part
+    return out
 
 
 class RasterMap:
@@ -260,7 +269,7 @@ class RasterMap:
         size = raster.pixel_size(*middle)
         step = max(1, round(spacing / size))
         _require_size(raster.path.name, _sizes((rows, columns), (step, step)))
-        amplitude, known = raster.read(rows, columns, step)
+        amplitude, _ = raster.read(rows, columns, step)
         if amplitude.min(initial=0.0) < 0:
             raise ValueError(
                 f"'{raster.path.name}' holds negative values, which are no amplitudes\n"
@@ -286,9 +295,7 @@ class RasterMap:
             north, east = places[..., 0], places[..., 1]
             return i, j, north, east, np.asarray(terrain(north, east), np.float64)
 
-        return Part(
-            raster.path.name, np.where(known, amplitude, 0), size * step, 2 * reach, pixel, ties
-        )
+        return Part(raster.path.name, amplitude, size * step, 2 * reach, pixel, ties)
 
 
 class Sentinel1Map:
@@ -371,7 +378,7 @@ def _sizes(window: tuple[slice, slice], looks: tuple[int, int]) -> tuple[int, in
 
 
 def _require_size(name: str, n: tuple[int, int]) -> None:
-    if n[0] * n[1] > LARGEST:
+    if n[0] * n[1] > LARGEST or max(n) > _LONGEST:
         raise ValueError(
             f"a part of '{name}' of {n[0]} x {n[1]} pixels is too large; {LARGEST / 1e6:.0f} "
             "million are held at most\n  set a coarser spacing, or a smaller reach"
