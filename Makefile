@@ -51,6 +51,7 @@ benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/fmu.py
 	$(BIN)/python benchmarks/imaging.py
 	$(BIN)/python benchmarks/closed_loop.py
+	$(BIN)/python benchmarks/maps.py
 	$(BIN)/python benchmarks/filters.py
 	$(BIN)/python benchmarks/verdicts.py
 	$(BIN)/python benchmarks/aircraft_images.py

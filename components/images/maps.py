@@ -21,7 +21,7 @@ from terrafix.cosim.declare.component import Component
 from terrafix.cosim.declare.parameters import Count, FilePath, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import Input, SharedInput, SharedOutput
 from terrafix.models.geometry.geodesy import geodetic
-from terrafix.models.images.mapped import Map, RasterMap, Sentinel1Map
+from terrafix.models.images.mapped import Beam, Map, RasterMap, Sentinel1Map, as_seen
 from terrafix.models.maps.dem import Dem, dem_from, flat_dem
 from terrafix.models.maps.elevation import elevations_about
 from terrafix.models.maps.raster import Raster, open_raster
@@ -31,6 +31,8 @@ from terrafix.models.radar.boresight import boresight_on_terrain
 _ALIGNED = np.array([0.0, 0.0, 0.0, 1.0])
 _ROUNDS, _CLOSE = 20, 1.0
 """Of the search for the ground's height under the boresight, and how close it comes [m]."""
+_DIAGONAL = 1.45
+"""Of a square that is turned, and spare."""
 _OF_ANNOTATION = ("first_line", "first_sample")
 Height = Callable[[float, float], float]
 
@@ -52,8 +54,8 @@ class InView(Component):
     v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
     q_be = Input((4,), unit="1", frame="b", doc="true attitude, Earth-fixed to body")
 
-    def _place(self, height: Height) -> tuple[float, float]:
-        """Latitude and longitude [rad] where the boresight meets the ground, to some meters."""
+    def _beam(self, height: Height) -> tuple[Beam, float, float]:
+        """The beam, and latitude and longitude [rad] where it meets the ground, to some meters."""
         r, v, q_be, look, squint = (
             common(self, name) for name in ("r_e", "v_e", "q_be", "look", "squint")
         )
@@ -66,14 +68,16 @@ class InView(Component):
             if not abs(rise) > _CLOSE:  # nor where it is not known
                 break
             h += 0.7 * rise
-        return latitude, longitude
+        return Beam(r, v, beam.point), latitude, longitude
 
 
 class ReferenceMap(InView, ReferenceSource):
     """Reference that is a part of a map: a GeoTIFF of amplitudes, or an image of Sentinel-1.
 
-    Heights of its tie points are those of the terrain, which has to cover it: a square that is
-    turned takes half as much again as `reach`. What the map does not know is not matched.
+    It is drawn as the radar will see it: on relief a map and an image differ by more than a shift,
+    and what is matched all the same is tens of meters off. Heights are those of the terrain, which
+    has to cover it: a square that is turned takes half as much again as `reach`. What the map does
+    not know is not matched.
     """
 
     map_file = FilePath(doc="GeoTIFF of one band, any system, turned or not; .tiff of Sentinel-1")
@@ -117,8 +121,9 @@ class ReferenceMap(InView, ReferenceSource):
         )
         source = self._map()
         try:
-            place = self._place(lambda *at: float(dem.known_at(*at)))
-            reference = source.about(*place, reach, spacing, dem.at)
+            beam, *place = self._beam(lambda *at: float(dem.known_at(*at)))
+            part = source.about(*place, _DIAGONAL * reach, spacing, dem.at)
+            reference = as_seen(part, beam, reach, spacing, dem.at)
         except ValueError as error:
             raise ConfigurationError(
                 f"'{self.name}' has no reference where the beam looks: {error}"
@@ -184,7 +189,8 @@ class ElevationMap(InView):
             return float(near.known_at(latitude, longitude))
 
         try:
-            dem = referred(self, elevations_about(raster, *self._place(height), reach))
+            _, *place = self._beam(height)
+            dem = referred(self, elevations_about(raster, *place, reach))
         except ValueError as error:
             raise ConfigurationError(
                 f"'{self.name}' has no heights where the beam looks: {error}"

@@ -413,15 +413,11 @@ def read_jacksboro() -> Dem:
 
 def write_dem(dem: Dem, path: Path) -> None:
     """Write an elevation model to a file (.npz) that `read_dem` reads."""
-    np.savez(
-        path,
-        height_m=dem.height,
-        latitude0_deg=np.degrees(dem.latitude0),
-        longitude0_deg=np.degrees(dem.longitude0),
-        latitude_step_deg=np.degrees(dem.latitude_step),
-        longitude_step_deg=np.degrees(dem.longitude_step),
-        **({_EPSG: dem_code(dem)} if dem.datum else {}),
-    )
+    degrees = np.degrees([dem.latitude0, dem.longitude0, dem.latitude_step, dem.longitude_step])
+    arrays: dict[str, Any] = dict(zip(KEYS, (dem.height, *degrees), strict=True))
+    if dem.datum:
+        arrays[_EPSG] = dem_code(dem)
+    np.savez(path, **arrays)
 
 
 def dem_code(dem: Dem) -> int:

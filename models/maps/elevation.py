@@ -18,6 +18,8 @@ from terrafix.models.maps.raster import LARGEST, SUFFIXES, Raster, knots, open_r
 
 _CLOSE = 0.02
 """How exactly places of a grid are known in pixels of a raster."""
+_STRIP = 128
+"""Rows of a grid that are interpolated at a time."""
 _MERIDIAN = 6371e3
 _NEAR_POLE = np.radians(89.9)
 
@@ -35,7 +37,9 @@ def read_elevations(path: Path) -> Dem:
         If it cannot be read, is too large, or holds what is no height of the Earth.
     """
     if path.suffix.lower() not in SUFFIXES:
-        return read_dem(path)
+        dem = read_dem(path)
+        _require_heights(dem, path)
+        return dem
     raster = open_raster(path)
     n = raster.shape[0] * raster.shape[1]
     if n > LARGEST:
@@ -46,7 +50,7 @@ def read_elevations(path: Path) -> Dem:
         )
     if raster.north_up:
         return _cut(raster, slice(0, raster.shape[0]), slice(0, raster.shape[1]))
-    rows, columns = (np.array([0.0, (k - 1) / 2, k - 1.0]) for k in raster.shape)
+    rows, columns = (np.linspace(0, k - 1, 9) for k in raster.shape)
     latitude, longitude = raster.places(rows[:, None], columns[None, :])
     return _resampled(raster, latitude, longitude)
 
@@ -118,14 +122,18 @@ def _resampled(raster: Raster, latitude: FloatArray, longitude: FloatArray) -> D
     values = _known(raster, rows, columns)
     at = knots(raster.pixels, (south, north), (west, east), np.full(2, _CLOSE))[2]
     u, w = (np.linspace(0, len(at) - 1, n) for n in (n_lat, n_lon))
-    places = np.meshgrid(u, w, indexing="ij")
-    row, column = (
-        map_coordinates(at[..., k], places, order=1, mode="nearest") - first
-        for k, first in ((0, rows.start), (1, columns.start))
-    )
-    height = map_coordinates(values, [row, column], order=1, mode="constant", cval=np.nan)
+    height = np.empty((n_lat, n_lon), np.float32)
+    for first in range(0, n_lat, _STRIP):
+        places = np.meshgrid(u[first : first + _STRIP], w, indexing="ij")
+        pixel = [
+            map_coordinates(at[..., k], places, order=1, mode="nearest") - start
+            for k, start in ((0, rows.start), (1, columns.start))
+        ]
+        height[first : first + _STRIP] = map_coordinates(
+            values, pixel, order=1, mode="constant", cval=np.nan
+        )
     step = (north - south) / (n_lat - 1), (east - west) / (n_lon - 1)
-    return _dem(raster, height.astype(np.float32), south, west, *step)
+    return _dem(raster, height, south, west, *step)
 
 
 def _known(raster: Raster, rows: slice, columns: slice) -> Single:
@@ -139,6 +147,10 @@ def _dem(
     raster: Raster, height: Single, south: float, west: float, north_step: float, east_step: float
 ) -> Dem:
     dem = Dem(height, south, west, north_step, east_step, raster.path.name)
-    if dem.n_void == height.size:
-        raise ValueError(f"'{raster.path}' holds nothing but voids where it is read")
+    _require_heights(dem, raster.path)
     return replace(dem, datum=raster.vertical, sigma=raster.vertical_sigma)
+
+
+def _require_heights(dem: Dem, path: Path) -> None:
+    if dem.n_void == dem.height.size:
+        raise ValueError(f"'{path}' holds nothing but voids where it is read")

@@ -90,7 +90,7 @@ def on_ellipsoid(dem: Dem, source: str = GRID) -> Dem:
     if not dem.datum:
         raise ValueError(f"nothing says what the heights of {dem.name} refer to")
     latitude, longitude = (
-        first + step * np.arange(n)
+        np.asarray(first + step * np.arange(n), np.float64)
         for first, step, n in (
             (dem.latitude0, dem.latitude_step, dem.height.shape[0]),
             (dem.longitude0, dem.longitude_step, dem.height.shape[1]),
@@ -98,7 +98,10 @@ def on_ellipsoid(dem: Dem, source: str = GRID) -> Dem:
     )
     area = tuple(float(np.degrees(a[k])) for k in (0, -1) for a in (longitude, latitude))
     undulation, sigma = undulation_of(dem.datum, source, area)
-    coarse = [np.linspace(a[0], a[-1], _looked_up(a)) for a in (latitude, longitude)]
+    coarse = [
+        np.asarray(np.linspace(a[0], a[-1], _looked_up(a)), np.float64)
+        for a in (latitude, longitude)
+    ]
     N = undulation(*(np.asarray(a) for a in np.meshgrid(*coarse, indexing="ij")))
     if not np.isfinite(N).all():
         raise ValueError(f"the grid of {dem.datum} does not cover {dem.name}: {dem.described()}")

@@ -143,11 +143,10 @@ class Raster:
                 break
             bounds.append(slice(low, high + 1))
         if len(bounds) < 2:
-            middle = (float(np.degrees(np.mean(a))) for a in (latitude, longitude))
+            north, east = (float(np.degrees(np.mean(a))) for a in (latitude, longitude))
             raise ValueError(
-                "'{}' does not cover latitude {:.3f}, longitude {:.3f} deg\n  it covers {}".format(
-                    self.path.name, *middle, self.described()
-                )
+                f"'{self.path.name}' does not cover latitude {north:.3f}, longitude {east:.3f} deg"
+                f"\n  it covers {self.described()}"
             )
         return bounds[0], bounds[1]
 

@@ -320,11 +320,11 @@ def _orbit(root: ET.Element) -> Ephemeris:
     if {*_texts(root, where, "frame")} != {"Earth Fixed"}:
         raise ValueError("its orbit is not Earth-fixed")
     tags, _ = read_tags(_texts(root, where, "time"), "UTC")
-    states = [
+    r, v = (
         np.array([[_number(e.find(what), a) for a in "xyz"] for e in root.findall(where)])
         for what in ("position", "velocity")
-    ]
-    return Ephemeris(tags, (tags - tags[0]) / np.timedelta64(1, "s"), *states)
+    )
+    return Ephemeris(tags, (tags - tags[0]) / np.timedelta64(1, "s"), r, v)
 
 
 def _in_sequence(root: ET.Element, starts: NDArray[np.intp], n: int) -> NDArray[np.intp]:

@@ -15,10 +15,11 @@ from terrafix.cosim.basics.errors import TerrafixError  # noqa: E402
 from terrafix.cosim.declare.component import Component  # noqa: E402
 from terrafix.cosim.declare.ports import Output  # noqa: E402
 from terrafix.cosim.engine.simulation import Simulation  # noqa: E402
-from terrafix.models.geometry.geodesy import geodetic  # noqa: E402
+from terrafix.models.geometry.geodesy import ecef, geodetic  # noqa: E402
 from terrafix.models.images.reference import Reference  # noqa: E402
 from terrafix.models.maps.dem import dem_from, flat_dem  # noqa: E402
 from terrafix.models.maps.geoid import harmonic_undulation  # noqa: E402
+from terrafix.models.motion.arc import OrbitArc, seen_at  # noqa: E402
 from terrafix.models.motion.attitude import lvlh_quaternion_array  # noqa: E402
 from terrafix.models.radar.boresight import boresight_on_terrain  # noqa: E402
 
@@ -125,50 +126,70 @@ def speckle(n):
     return np.random.default_rng(0).rayleigh(40.0, (n, n)).astype(np.uint8) + 1
 
 
-@pytest.mark.parametrize("angle", [0.0, 45.0])
-def test_a_reference_is_the_part_of_the_map_that_the_beam_looks_at(tmp_path, angle):
-    """Its pixels lie where PROJ puts those of the map, to 0.02 of a pixel of 20 m."""
-    values, transform = speckle(900), centered(900, 20.0, angle)
-    part = run(reference_map(write(tmp_path / "m.tif", values, transform)))
-    side = part.amplitude.shape[0]
-    assert side == pytest.approx(200 * (np.sqrt(2) if angle else 1), abs=12)
-    reference = Reference(
-        part.amplitude, part.tie_rows, part.tie_columns, *np.moveaxis(part.places, -1, 0)
-    )
-    assert reference.height == pytest.approx(50.0)
-    # the map's first row and column of the part, found by its pixels
-    windows = np.lib.stride_tricks.sliding_window_view(values, (1, 40))[:, :, 0]
-    first = np.argwhere((windows == part.amplitude[0, :40]).all(axis=-1))
-    assert len(first) == 1
-    row, column = np.array([3.0, side / 2, side - 7.5]), np.array([side - 9.0, 11.5, side / 3])
+TO_UTM = pyproj.Transformer.from_crs(4326, 32615, always_xy=True)
+
+
+def waves(x, y):
+    """Amplitude of an artificial ground: it changes by 0.1 in a meter at most."""
+    return 100 + 40 * np.sin(x / 400) * np.cos(y / 500)
+
+
+def wavy(n, spacing, angle):
+    transform = centered(n, spacing, angle)
+    column, row = np.meshgrid(np.arange(n) + 0.5, np.arange(n) + 0.5)
     a, b, c, d, e, f = transform[:6]
-    i, j = row + first[0, 0] + 0.5, column + first[0, 1] + 0.5
-    to_degrees = pyproj.Transformer.from_crs(32615, 4326, always_xy=True)
-    wanted = to_degrees.transform(a * j + b * i + c, d * j + e * i + f)
+    return waves(a * column + b * row + c, d * column + e * row + f).astype(np.float32), transform
+
+
+def reference_of(part):
+    places = np.moveaxis(part.places, -1, 0)
+    return Reference(part.amplitude, part.tie_rows, part.tie_columns, *places)
+
+
+@pytest.mark.parametrize("ground", ["flat", "jacksboro"])
+@pytest.mark.parametrize("angle", [0.0, 70.0])
+def test_a_reference_shows_what_the_map_does_where_its_pixels_lie(tmp_path, angle, ground):
+    """Waves of a map in UTM, turned, seen in time and range: by PROJ at each tie point's place."""
+    path = write(tmp_path / "m.tif", *wavy(900, 12.0, angle))
+    terrain = {"flat": {"flat_height": 50.0}, "jacksboro": {"mirrored": True}}[ground]
+    part = run(reference_map(path), ground=Terrain(source=ground, **terrain))
+    assert part.amplitude.shape == pytest.approx((333, 333), abs=2)  # of 4 km by 12 m
+    reference = reference_of(part)
+    row, column = (np.rint(a).astype(int) for a in np.meshgrid(part.tie_rows, part.tie_columns))
     latitude, longitude, _ = reference.place(row, column)
-    meters = 6.37e6 * np.array(
-        [latitude - np.radians(wanted[1]), longitude - np.radians(wanted[0])]
-    )
-    assert np.abs(meters).max() < 0.02 * 20
-    # the beam's place is in its middle, where it meets ground 50 m high
-    (north, east), _ = beam(50.0)
-    assert reference.pixel(np.radians(north), np.radians(east))[:2] == pytest.approx(
-        [side / 2] * 2, abs=4
-    )
+    wanted = waves(*TO_UTM.transform(np.degrees(longitude), np.degrees(latitude)))
+    off = np.abs(part.amplitude[row, column] - wanted)
+    # interpolated twice, and drawn between tie points 50 m apart, which relief bends by meters
+    assert np.quantile(off, 0.99) < {"flat": 0.1, "jacksboro": 0.5}[ground]
+    relief = np.ptp(reference.height)
+    assert relief == pytest.approx(0) if ground == "flat" else relief > 100
+
+
+def test_its_rows_are_times_and_its_columns_ranges(tmp_path):
+    """Each tie point is seen in the beam's plane, at ranges that grow evenly, on the terrain."""
+    path = write(tmp_path / "m.tif", *wavy(900, 12.0, 0.0))
+    part = run(reference_map(path), ground=Terrain(source="jacksboro", mirrored=True))
+    p = ecef(*np.moveaxis(part.places, -1, 0))
+    aligned = np.array([0.0, 0.0, 0.0, 1.0])
+    doppler = boresight_on_terrain(R_E, V_E, Q_BE, aligned, LOOK, 0.0, flat_dem(0)).doppler(0.23)
+    t, R = seen_at(OrbitArc(R_E, V_E, 0.0, 5.0, 5.0), p, doppler, 0.23)
+    assert np.ptp(np.diff(R, axis=1)) < 0.02 * np.diff(R, axis=1).mean()
+    assert np.ptp(t, axis=1).max() < 2e-4  # 1.4 m; of a beam that is 30 m lower
+    speed = np.diff(t[:, 0]).mean() / np.diff(part.tie_rows).mean()
+    assert 12.0 / speed == pytest.approx(6800, rel=0.02)  # over the ground [m/s]
 
 
 def test_finer_pixels_are_averaged_and_unknown_ones_are_not_seen(tmp_path):
-    values = speckle(900)
-    values[:, 470:] = 0  # nodata, which is right of the middle
-    path = write(tmp_path / "m.tif", values, centered(900, 10.0), nodata=0)
+    values = speckle(1800)
+    values[:, 950:] = 0  # nodata, which is right of the middle
+    path = write(tmp_path / "m.tif", values, centered(1800, 5.0), nodata=0)
     part = run(reference_map(path, spacing=20.0))
-    assert part.amplitude.shape[0] == pytest.approx(200, abs=8)
-    whole = run(reference_map(path))
-    blocks = whole.amplitude[: 2 * part.amplitude.shape[0], :300].astype(float) ** 2
-    mean = np.sqrt(blocks.reshape(len(part.amplitude), 2, 150, 2).mean(axis=(1, 3)))
-    edge = int(np.flatnonzero((whole.amplitude == 0).all(axis=0))[0])
-    assert part.amplitude[:, : edge // 2] == pytest.approx(mean[:, : edge // 2], rel=1e-5)
-    assert (part.amplitude[:, edge // 2 + 1 :] == 0).all()
+    assert part.amplitude.shape == (200, 200)
+    seen = part.amplitude[part.amplitude > 0].astype(float)
+    assert 0.5 < len(seen) / part.amplitude.size < 0.6
+    # of Rayleigh's 40 sqrt(2): power is kept, and 16 looks and interpolation leave little speckle
+    assert np.sqrt(np.mean(seen**2)) == pytest.approx(40 * np.sqrt(2), rel=0.03)
+    assert seen.std() / seen.mean() < 0.523 / 4
 
 
 def test_heights_of_a_large_model_are_read_about_the_beam(tmp_path):
@@ -191,7 +212,7 @@ def test_heights_of_a_large_model_are_read_about_the_beam(tmp_path):
         reference_map(write(tmp_path / "m.tif", speckle(900), centered(900, 20.0))),
         ground=elevation_map(path, vertical_datum="ellipsoid", reach=3000.0),
     )
-    assert np.ptp(with_both.places[..., 2]) == pytest.approx(40.0, rel=0.1)  # of 4 km
+    assert np.ptp(with_both.places[..., 2]) == pytest.approx(45.0, abs=5)  # of 4 km, turned
 
 
 def test_heights_above_a_geoid_are_turned_to_the_ellipsoid(tmp_path):

@@ -9,6 +9,7 @@ from terrafix.components.truth.terrain import Terrain, scene_from
 from terrafix.cosim.basics.errors import ConfigurationError, SystemCheckError
 from terrafix.cosim.engine.simulation import Simulation
 from terrafix.cosim.system.system import System
+from terrafix.models.maps import geoid
 from terrafix.models.maps.dem import Dem, write_dem
 
 
@@ -90,3 +91,57 @@ def test_what_covers_the_ground_is_told_and_what_it_has_no_use_for_is_refused():
     assert not Terrain(source="flat", cover="texture").takes("parcels")
     assert not Terrain(source="flat", cover="urban").takes("point_density")
     assert Terrain(source="flat", cover="urban").takes("point_brightness")
+
+
+def tile(folder, value=100):
+    path = folder / "N44W072.hgt"
+    np.full((1201, 1201), value, ">i2").tofile(path)
+    return path
+
+
+def heights(**settings):
+    system = System("ground")
+    system.add(Terrain(**settings), name="terrain")
+    simulation = Simulation(system)
+    simulation.run_until("0")
+    return system.nodes["terrain"].height
+
+
+def test_heights_of_srtm_are_told_above_the_ellipsoid(tmp_path):
+    """Mount Washington stands on a geoid 27 to 28 m below the ellipsoid."""
+    rise = heights(dem_file=tile(tmp_path), geoid="degree 70") - 100
+    assert rise.mean() == pytest.approx(-27.6, abs=1.0)
+    assert np.ptp(rise) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "the geoid EGM96 is not there: PROJ has no grid"),
+        ({"vertical_datum": "EGM2008"}, "'N44W072.hgt' says that its heights refer to EGM96"),
+    ],
+)
+def test_a_geoid_that_is_not_there_or_contradicts_is_an_error(
+    tmp_path, settings, message, monkeypatch
+):
+    monkeypatch.setattr(geoid, "_by_proj", lambda grid: None)
+    monkeypatch.setattr(geoid, "_package_grid", lambda: None)
+    with pytest.raises(SystemCheckError, match=message):
+        heights(dem_file=tile(tmp_path), **settings)
+
+
+def test_a_file_that_does_not_say_what_its_heights_refer_to_is_refused_unless_it_is_stated(
+    tmp_path,
+):
+    path = tmp_path / "map.npz"
+    write_dem(Dem(np.full((3, 3), 5, np.float32), 0.6, -1.4, 1e-3, 1e-3, datum=""), path)
+    with pytest.raises(SystemCheckError, match=r"(?s)does not say .* set terrain\.vertical_datum"):
+        heights(dem_file=path)
+    assert (heights(dem_file=path, vertical_datum="ellipsoid") == 5).all()
+    assert not Terrain(dem_file=path, vertical_datum="ellipsoid").takes("geoid")
+    assert Terrain(dem_file=path).takes("geoid")
+
+
+def test_a_tile_of_voids_is_refused(tmp_path):
+    with pytest.raises(SystemCheckError, match=r"N44W072\.hgt' holds nothing but voids"):
+        heights(dem_file=tile(tmp_path, -32768), geoid="degree 70")

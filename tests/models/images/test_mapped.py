@@ -51,7 +51,7 @@ def test_places_between_tie_points_are_projs(tmp_path, crs, longitude, latitude,
     path = sparse(tmp_path / "m.tif", crs, about(crs, longitude, latitude, spacing, angle), 1500)
     raster = open_raster(path)
     place = np.radians(latitude), np.radians(longitude)
-    reference = RasterMap(raster).about(*place, 7000.0, 0.0, FLAT)
+    reference = RasterMap(raster).about(*place, 7000.0, 0.0, FLAT).reference()
     n = reference.amplitude.shape
     rng = np.random.default_rng(1)
     row, column = (rng.uniform(0, k - 1, 300) for k in n)
@@ -83,7 +83,7 @@ def test_ties_on_both_sides_of_the_date_line_are_neighbors(tmp_path):
     path = sparse(tmp_path / "m.tif", crs, about(crs, 180.0, 0.0, 1.35e-4), 1500)
     raster = open_raster(path)
     for side in (1, -1):  # asked for from either side
-        reference = RasterMap(raster).about(0.0, side * np.pi, 6000.0, 0.0, FLAT)
+        reference = RasterMap(raster).about(0.0, side * np.pi, 6000.0, 0.0, FLAT).reference()
         assert np.abs(np.diff(reference.longitude, axis=1)).max() < np.radians(0.15)
         for longitude in (179.95, -179.95, 180.05):
             _, column, inside = reference.pixel(0.0, np.radians(longitude))
@@ -96,7 +96,7 @@ def test_ties_on_both_sides_of_the_date_line_are_neighbors(tmp_path):
 def test_a_map_about_a_pole_says_so(tmp_path):
     path = sparse(tmp_path / "m.tif", "EPSG:3413", about("EPSG:3413", 0.0, 90.0, 15.0), 500)
     with pytest.raises(ValueError, match="about a pole"):
-        RasterMap(open_raster(path)).about(np.radians(89.99), 0.0, 3000.0, 0.0, FLAT)
+        RasterMap(open_raster(path)).about(np.radians(89.99), 0.0, 3000.0, 0.0, FLAT).reference()
 
 
 def test_of_a_map_of_10000_by_10000_only_a_part_is_taken(tmp_path):
@@ -114,6 +114,8 @@ def test_of_a_map_of_10000_by_10000_only_a_part_is_taken(tmp_path):
         window = rasterio.windows.Window(4096, 4096, 1536, 1536)
         dataset.write(np.ones((1536, 1536), np.float32), 1, window=window)
     place = np.radians(36.0), np.radians(-84.0)
-    reference = RasterMap(open_raster(tmp_path / "m.tif")).about(*place, 1500.0, 10.0, FLAT)
+    reference = (
+        RasterMap(open_raster(tmp_path / "m.tif")).about(*place, 1500.0, 10.0, FLAT).reference()
+    )
     assert reference.amplitude.shape == pytest.approx((429, 429), abs=12)
     assert (reference.amplitude > 0).mean() > 0.9

@@ -10,7 +10,7 @@ rasterio = pytest.importorskip("rasterio", reason="of the extra 'sar'")
 
 from terrafix.models.geometry.geodesy import ecef, geodetic  # noqa: E402
 from terrafix.models.geometry.geolocation import ground_point  # noqa: E402
-from terrafix.models.images.mapped import Sentinel1Map  # noqa: E402
+from terrafix.models.images.mapped import Beam, Sentinel1Map, as_seen  # noqa: E402
 from terrafix.models.maps.dem import flat_dem  # noqa: E402
 from terrafix.models.maps.sentinel1 import SPEED_OF_LIGHT, read_sentinel1  # noqa: E402
 from terrafix.models.motion.ephemeris import read_eof  # noqa: E402
@@ -81,7 +81,7 @@ def test_a_part_of_it_becomes_a_reference_of_square_pixels(real):
     r, v = real.orbit.at(real.seen_at(9064, 11_700)[0])
     p = ground_point(r, v, real.seen_at(9064, 11_700)[1], 0.0)
     latitude, longitude, _ = (float(a) for a in geodetic(p))
-    reference = Sentinel1Map(real).about(latitude, longitude, 1700.0, 0.0, FLAT)
+    reference = Sentinel1Map(real).about(latitude, longitude, 1700.0, 0.0, FLAT).reference()
     # 13.9 m along the track, four samples of 2.33 m over the sine of incidence across it
     assert reference.amplitude.shape == pytest.approx((298, 295), abs=3)
     row, column, inside = reference.pixel(latitude, longitude)
@@ -96,6 +96,29 @@ def test_a_part_of_it_becomes_a_reference_of_square_pixels(real):
     assert np.sqrt((reference.amplitude.astype(float) ** 2).mean()) == pytest.approx(
         whole, rel=0.05
     )
+
+
+def test_drawn_as_another_radar_sees_it_what_is_bright_lies_where_it_lies(real):
+    """The brightest pixel of a part, found again by its place on an image 600 m off the orbit."""
+    t, R = real.seen_at(9064, 11_700)
+    r, v = real.orbit.at(t)
+    p = ground_point(r, v, R, 0.0, 0.0)
+    latitude, longitude, _ = (float(a) for a in geodetic(p))
+    part = Sentinel1Map(real).about(latitude, longitude, 2500.0, 0.0, FLAT)
+    beam = Beam(r + 600 * p / np.linalg.norm(p), v, p)
+    reference = as_seen(part, beam, 1500.0, 12.0, FLAT)
+    assert reference.amplitude.shape == (250, 250)
+    own = part.reference()
+    middle = [round(float(a)) for a in own.pixel(latitude, longitude)[:2]]
+    near = own.amplitude[middle[0] - 80 : middle[0] + 80, middle[1] - 80 : middle[1] + 80]
+    i, j = np.unravel_index(near.argmax(), near.shape)
+    north, east, _ = own.place(middle[0] - 80 + i, middle[1] - 80 + j)
+    row, column, inside = reference.pixel(north, east)
+    assert inside
+    i, j = round(float(row)), round(float(column))
+    about = reference.amplitude[i - 12 : i + 13, j - 12 : j + 13]
+    found = np.unravel_index(about.argmax(), about.shape)
+    assert np.hypot(found[0] - 12, found[1] - 12) < 1.6
 
 
 # ------------------------------------------------------------------------- written here
