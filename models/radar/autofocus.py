@@ -88,6 +88,8 @@ FAR = 3.0
 EVIDENCE = 6.0
 """Curvature of all blocks together, in its standard errors, at least: speckle on the peaks that a
 climb finds in it has 2 to 4."""
+AWAY = 1.0
+"""From the peak of the parts to that of the blocks, at most, in depths of focus."""
 FEWEST = 5.0
 """Blocks that hold the velocity, effectively, at least."""
 _CLOSE = 0.05
@@ -362,7 +364,7 @@ class _Search:
             (peak.evidence < EVIDENCE, REASONS[2]),
             (peak.n_blocks < FEWEST, REASONS[3]),
             (peak.sigma > self.scatter, REASONS[4]),
-            (abs(peak.shift) > HALF_WIDTH, REASONS[5]),
+            (abs(peak.shift) > AWAY, REASONS[5]),
         )
         reason = next((why for refused, why in refusals if refused), REASONS[0])
         return Focus(velocity, sharpness, sigma, reason == REASONS[0], reason)
@@ -373,7 +375,7 @@ class _Search:
         for _ in range(4):
             found = self._parabolas(best + moved * self.depth / _FINE)
             peak = replace(found, shift=found.shift + moved / _FINE)
-            if not abs(found.shift) > _CLOSE or abs(peak.shift) > 2 * HALF_WIDTH:
+            if not abs(found.shift) > _CLOSE or abs(peak.shift) > AWAY:
                 break
             moved = round(peak.shift * _FINE)
         return peak
