@@ -175,9 +175,8 @@ def relief(images: int) -> None:
             velocity_rate=field.by_time,
         )
         image = imager.image(processing, focus.velocity)
-        found = imager.velocity_at(
-            processing, focus.velocity, field.by_time, image.pixel(0.0, R, 0.0)
-        )
+        row, column = (float(x) for x in image.pixel(0.0, R, 0.0))
+        found = imager.velocity_at(processing, focus.velocity, field.by_time, (row, column))
         height = height_seen(dem, r, v, R)
         around = np.mean(
             [
@@ -216,5 +215,7 @@ if __name__ == "__main__":
     parser.add_argument("--images", type=int, default=40)
     parser.add_argument("--relief", type=int, default=12)
     arguments = parser.parse_args()
-    kinds(arguments.images)
-    relief(arguments.relief)
+    if arguments.images:
+        kinds(arguments.images)
+    if arguments.relief:
+        relief(arguments.relief)
