@@ -35,7 +35,19 @@ from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("TERRAFIX_DATA", ROOT / ".." / "shared" / "data"))
 RADARSAT = Radar(5.3e9, 1256.98, 32.317e6, -0.72135e12, 41.75e-6, 0.75 * 1256.98)
-CHUNKS = ("airport", "stanley_park", "ubc", "english_bay_1", "english_bay_2")
+CHUNKS = {  # and when their middle lines were received [s]
+    "airport": 4.42,
+    "stanley_park": 6.09,
+    "ubc": 5.65,
+    "english_bay_1": 6.18,
+    "english_bay_2": 7.40,
+}
+SLOPE, RATE = -1.7e-4, -0.056  # of the effective velocity on that orbit [m/s per m], [m/s^2]
+FAR = 150.0  # of starts [m/s]
+SEA = [  # rows and columns of english_bay_1 without ships
+    (slice(660, 1190), slice(330, 670)),
+    (slice(880, 1190), slice(0, 670)),
+]
 SIZE = 256  # [pixels] of a chip
 
 
@@ -107,32 +119,67 @@ def domain_of(name: str) -> RangeDoppler:
     fraction, _ = fractional_centroid(echo, RADARSAT.prf)
     centroid = unwrapped_centroid(fraction, RADARSAT.prf, -6900.0)
     return range_doppler(
-        echo, RADARSAT, near_range=near, centroid=centroid, velocity=7062.0
+        *(echo, RADARSAT),
+        near_range=near,
+        centroid=centroid,
+        velocity=7062.0,
+        velocity_slope=SLOPE,
+        operations=row_operations(),
     ).cropped()
 
 
 def focusing(domains: dict[str, RangeDoppler], starts: int) -> None:
-    print(f"autofocus, {starts} starts within +-50 m/s of 7062")
+    """Starts anywhere within 150 m/s; then what five scenes say of one velocity."""
+    print(f"autofocus, {starts} starts within +-{FAR:g} m/s of 7062")
+    found = []
     for k, (name, domain) in enumerate(domains.items()):
         rng = np.random.default_rng([1, k])
         curve = SharpnessCurve(domain, 2.0)
-        found = [autofocus(curve, 7062 + x) for x in rng.uniform(-50, 50, starts)]
-        V = np.array([f.velocity for f in found if f.accepted])
-        far = np.abs(V - 7062).max() if len(V) else np.nan
+        right = autofocus(curve, 7062.0, velocity_rate=RATE)
+        every = [
+            autofocus(curve, 7062 + x, max_change=FAR + 50, velocity_rate=RATE)
+            for x in rng.uniform(-FAR, FAR, starts)
+        ]
+        V = np.array([f.velocity for f in every if f.accepted])
+        wrong = int(np.sum(np.abs(V - right.velocity) > right.sigma))
+        there = right.velocity - SLOPE * (domain.slant_range.mean() - 995e3)
+        there -= RATE * (CHUNKS[name] - 6.0)
+        found.append((there, right.sigma))
         print(
-            f"  {name:14s} {100 * len(V) / starts:5.0f} % accepted, {V.min():.1f} to "
-            f"{V.max():.1f}, furthest {far:.1f} m/s"
+            f"  {name:14s} {100 * len(V) / starts:5.0f} % accepted, {wrong} wrong, {V.min():.2f} "
+            f"to {V.max():.2f}; {right.velocity:.2f} +- {right.sigma:.2f} m/s, at 995 km and 6 s "
+            f"{there:.2f}"
         )
+    V, sigma = np.array(found).T
+    mean = np.average(V, weights=sigma**-2)
+    print(
+        f"  all: {mean:.2f} +- {np.sum(sigma**-2) ** -0.5:.2f} m/s, chi-square "
+        f"{np.sum(((V - mean) / sigma) ** 2):.1f} of {len(V) - 1}"
+    )
     refused = []
     for seed in range(20):
         echo = speckle((1536, 2048), seed)
         domain = range_doppler(
-            echo, RADARSAT, near_range=988647.0, centroid=-7000.0, velocity=7062.0
+            *(echo, RADARSAT),
+            near_range=988647.0,
+            centroid=-7000.0,
+            velocity=7062.0,
+            operations=row_operations(),
         ).cropped()
-        curve = SharpnessCurve(domain, 2.0)
-        rng = np.random.default_rng([2, seed])
-        refused += [not autofocus(curve, 7062 + x).accepted for x in rng.uniform(-50, 50, 5)]
+        refused += nothing(domain, [2, seed])
     print(f"  speckle        {100 * np.mean(refused):5.0f} % refused, of {len(refused)}")
+    refused = []
+    for k, part in enumerate(SEA):
+        refused += nothing(domains["english_bay_1"], [3, k], *part)
+    print(f"  open sea       {100 * np.mean(refused):5.0f} % refused, of {len(refused)}")
+
+
+def nothing(
+    domain: RangeDoppler, seed: list[int], rows: slice | None = None, columns: slice | None = None
+) -> list[bool]:
+    """Whether what shows nothing is refused."""
+    curve, rng = SharpnessCurve(domain, 2.0, rows, columns), np.random.default_rng(seed)
+    return [not autofocus(curve, 7062 + x).accepted for x in rng.uniform(-50, 50, 5)]
 
 
 def chip(amplitude: np.ndarray, rng: np.random.Generator) -> tuple[Searchable, np.ndarray]:

@@ -40,6 +40,7 @@ from terrafix.models.sensors.effective_velocity import effective_velocity_array
 SYSTEM = Path(__file__).parents[1] / "examples" / "spacecraft_sar_real_echo.toml"
 TIMES = ("4.42", "6.09", "7.4")  # [s]
 PIXEL = np.array([5.39, 7.9])  # [m] along the track and across it, on the ground
+VELOCITY_SIGMA = 0.26  # [m/s], rms of what autofocus states
 IMAGING = ("terrain", "echo", "reference", "former", "matcher", "album")
 SEA = flat_dem()
 
@@ -129,7 +130,7 @@ def open_loop() -> System:
     parts = system.nodes
     drawn = CommonFix(
         geolocation_sigma=parts["matcher"].setting("geolocation_sigma"),
-        velocity_sigma=parts["former"].setting("velocity_sigma"),
+        velocity_sigma=VELOCITY_SIGMA,
         range_sigma=parts["former"].setting("range_sigma"),
         look=parts["echo"].setting("look"),
         squint=parts["echo"].setting("squint"),

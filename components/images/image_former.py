@@ -232,9 +232,8 @@ class ImageFormer(Component):
             own = field.velocity, velocity_sigma
             return _Formed(image, processing, focus, *own, field.velocity)
         image = imager.image(processing, focus.velocity)
-        velocity = imager.velocity_at(
-            processing, focus.velocity, field.by_time, image.pixel(0.0, *self._beam(m))
-        )
+        row, column = (float(x) for x in image.pixel(0.0, *self._beam(m)))
+        velocity = imager.velocity_at(processing, focus.velocity, field.by_time, (row, column))
         relief = abs(field.by_height) * float(self.height_sigma[m])
         return _Formed(
             image, processing, focus, velocity, float(np.hypot(focus.sigma, relief)), field.velocity
@@ -276,7 +275,7 @@ class ImageFormer(Component):
     def _expected_velocity(self, m: int, wavelength: float) -> tuple[VelocityField, float]:
         """Effective velocity that a member's estimate implies, and its standard deviation."""
         r, v = self.prior.r_e[m], self.prior.v_e[m]
-        speed = np.linalg.norm(v)
+        speed = float(np.linalg.norm(v))
         beam_range, beam_doppler = self._beam(m)
         sine = wavelength * beam_doppler / (2 * speed)
         try:

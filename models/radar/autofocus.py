@@ -88,6 +88,8 @@ FAR = 3.0
 EVIDENCE = 6.0
 """Curvature of all blocks together, in its standard errors, at least: speckle on the peaks that a
 climb finds in it has 2 to 4."""
+AWAY = 0.75
+"""From the grid point where most blocks are sharp to their peak, at most, in depths of focus."""
 FEWEST = 5.0
 """Blocks that hold the velocity, effectively, at least."""
 _CLOSE = 0.05
@@ -356,24 +358,40 @@ class _Search:
         step, sharpness = self.curve.step, self.curve.at(best)
         if abs(best - self.first) > self.limit:
             return Focus(best * step, sharpness, np.inf, False, REASONS[1])
-        peak = self._peak(best)
+        best, guess = self._most(best)
+        peak = self._peak(best, guess)
         velocity, sigma = (best + peak.shift * self.depth) * step, peak.sigma * self.depth * step
         refusals = (
             (peak.evidence < EVIDENCE, REASONS[2]),
             (peak.n_blocks < FEWEST, REASONS[3]),
             (peak.sigma > self.scatter, REASONS[4]),
-            (abs(peak.shift) > HALF_WIDTH, REASONS[5]),
+            (abs(peak.shift) > AWAY, REASONS[5]),
         )
         reason = next((why for refused, why in refusals if refused), REASONS[0])
         return Focus(velocity, sharpness, sigma, reason == REASONS[0], reason)
 
-    def _peak(self, best: int) -> _Peak:
+    def _most(self, best: int) -> tuple[int, float]:
+        """Grid point where most blocks are sharp, and from there to their peak [depths].
+
+        A few ships that outshine the rest of a scene make a peak of the parts of their own.
+        """
+        stride = max(1, round(self.depth / 2))
+        sharp = [float(self.curve.blocks(best + k * stride).mean()) for k in range(-2, 3)]
+        k = int(np.argmax(sharp))
+        shift = 0.0
+        if 0 < k < 4:
+            low, middle, high = sharp[k - 1 : k + 2]
+            curvature = low - 2 * middle + high
+            shift = (low - high) / (2 * curvature) if curvature else 0.0
+        return best + (k - 2) * stride, shift * stride / self.depth
+
+    def _peak(self, best: int, guess: float) -> _Peak:
         """Peak of the blocks, from a grid point, by parabolas that are moved to it."""
-        moved = 0
+        moved = round(guess * _FINE)
         for _ in range(4):
             found = self._parabolas(best + moved * self.depth / _FINE)
             peak = replace(found, shift=found.shift + moved / _FINE)
-            if not abs(found.shift) > _CLOSE or abs(peak.shift) > 2 * HALF_WIDTH:
+            if not abs(found.shift) > _CLOSE or abs(peak.shift) > AWAY:
                 break
             moved = round(peak.shift * _FINE)
         return peak

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from terrafix.models.core.arrays import ComplexArray
 from terrafix.models.radar.autofocus import REASONS as FOCUS_REASONS
@@ -219,7 +218,7 @@ class Imager:
         processing: Processing,
         velocity: float,
         velocity_rate: float,
-        pixel: tuple[ArrayLike, ArrayLike],
+        pixel: tuple[float, float],
     ) -> float:
         """Velocity that focuses a pixel, from that which focuses the middle [m/s].
 
@@ -237,8 +236,8 @@ class Imager:
         image, (row, column) = self.image(processing, velocity), pixel
         spacing = image.slant_range[1] - image.slant_range[0]
         middle = image.slant_range[image.columns].mean()
-        beyond = image.slant_range[0] + spacing * float(column) - middle
-        late = image.t[0] + float(row) / self.radar.prf - self.curve(processing).middle
+        beyond = image.slant_range[0] + spacing * column - middle
+        late = image.t[0] + row / self.radar.prf - self.curve(processing).middle
         return float(velocity + processing.velocity_slope * beyond + velocity_rate * late)
 
     def _band(self, domain: RangeDoppler) -> tuple[float, float]:

@@ -113,13 +113,13 @@ def test_a_state_set_back_continues_to_the_same_bytes(flown, halt, tmp_path):
 def test_where_autofocus_refuses_the_fix_comes_without_a_velocity(monkeypatch):
     from dataclasses import replace
 
-    from terrafix.models.radar.imaging import Imager
+    from terrafix.models.radar.imaging import FOCUS_REASONS, Imager
 
     focus = Imager.focus
 
-    def refused(self, candidates, velocity):
-        processing, found = focus(self, candidates, velocity)
-        return processing, replace(found, accepted=False, reason="refused for the test")
+    def refused(self, *args, **kwargs):
+        processing, found = focus(self, *args, **kwargs)
+        return processing, replace(found, accepted=False, reason=FOCUS_REASONS[4])
 
     monkeypatch.setattr(Imager, "focus", refused)
     data = simulate(small(), members=2, duration="9").dataset
@@ -127,6 +127,7 @@ def test_where_autofocus_refuses_the_fix_comes_without_a_velocity(monkeypatch):
     assert at_fix(data, "matcher.fix.present").tolist() == [[1, 1, 1, 0]] * 2
     assert (at_fix(data, "correct.innovation.accepted") == 1).all()
     assert (at_fix(data, "correct.innovation.dof") == 3).all()
+    assert (at_fix(data, "former.reason") == 4).all()
 
 
 def test_what_is_not_recognized_gives_no_fix():

@@ -19,6 +19,8 @@ from terrafix.models.geometry.geolocation import ground_point
 from terrafix.models.maps.dem import flat_dem
 from terrafix.models.radar.boresight import boresight_on_terrain
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT
+from terrafix.models.radar.imaging import BLIND, OPEN, REASONS
+from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
 ALIGNED = np.array([0.0, 0.0, 0.0, 1.0])
 LOOK = np.radians(34.3)
@@ -182,7 +184,8 @@ def believing(**settings):
     acquired = SimpleNamespace(
         beam_range=np.array([861013.0]),
         beam_doppler=np.array([54.0]),
-        side=np.ones(1),
+        time_sigma=np.array([1e-5]),
+        side=np.array([1.0]),
         fresh=np.ones(1, np.bool_),
     )
     P = np.diag(np.arange(1.0, 10.0))[None]
@@ -204,10 +207,13 @@ def test_the_velocity_that_focuses_falls_with_range():
         np.sqrt(V_E @ V_E + (R_E - ground_point(R_E, V_E, 861013.0 + d, sine)) @ a)
         for d in (-1000.0, 0.0, 1000.0)
     )
-    velocity, slope = believing()._expected_velocity(0, WAVELENGTH)
-    assert velocity == pytest.approx(middle, rel=1e-4)
-    assert slope == pytest.approx((far - near) / 2000.0, rel=0.02)
-    assert slope < -1e-4  # 0.13 m/s in a kilometer
+    field, sigma = believing()._expected_velocity(0, WAVELENGTH)
+    assert field.velocity == pytest.approx(middle, rel=1e-4)
+    assert field.by_range == pytest.approx((far - near) / 2000.0, rel=0.02)
+    assert field.by_range < -1e-4  # 0.13 m/s in a kilometer
+    # variances 4, 5, 6 of velocity: that along the track, times the speed over the effective one
+    variance = V_E @ np.diag([4.0, 5.0, 6.0]) @ V_E / middle**2
+    assert sigma == pytest.approx(np.sqrt(variance), rel=1e-4)
 
 
 def test_the_expected_centroid_has_the_estimates_uncertainty():
@@ -219,34 +225,82 @@ def test_the_expected_centroid_has_the_estimates_uncertainty():
     assert sigma[0] == pytest.approx(2 / WAVELENGTH * np.sqrt(variance), rel=1e-6)
 
 
-@pytest.mark.parametrize(("accepted", "sigma"), [(True, 0.5), (False, 0.3)])
-def test_the_error_of_the_autofocus_is_part_of_the_velocitys(monkeypatch, accepted, sigma):
-    """Root of the sum of squares: 0.3 of the settings and 0.4 of the image make 0.5 m/s."""
+def forming(monkeypatch, focus, **settings):
+    """What an image former sends whose imager has a focus at hand."""
     sent = {}
-    former = believing(velocity_sigma=0.3, range_sigma=0.0)
+    former = believing(range_sigma=0.0, **settings)
+    former.prior.P[:, 6:, 6:] *= 1e-8
     former.port_views |= {
         "image": SimpleNamespace(publish=lambda t, valid, **fields: sent.update(fields)),
         "images": SimpleNamespace(put=lambda _: None),
+        "reason": np.full(1, np.nan),
     }
-    focus = SimpleNamespace(velocity=7101.0, sigma=0.4, accepted=accepted)
     imager = SimpleNamespace(
-        radar=SimpleNamespace(wavelength=WAVELENGTH, prf=2160.0),
+        radar=SimpleNamespace(wavelength=WAVELENGTH, prf=2160.0, range_spacing=9.4),
         fraction=0.0,
         step=1.0,
+        migration_step=50.0,
         processing=lambda f, *_: f,
-        focus=lambda found, _: (found[0], focus),
-        image=lambda *_: SimpleNamespace(data=np.ones((400, 400), complex)),
+        focus=lambda found, *_, **reach: sent.update(reach) or (found[0], focus),
+        image=lambda _, V: SimpleNamespace(
+            data=np.ones((400, 400), complex), velocity=V, pixel=lambda *_: (0.0, 0.0)
+        ),
+        velocity_at=lambda _, V, *rest: V + 0.25,
     )
     place = slice(0, 192), slice(0, 96), (95.5, 47.5)
     monkeypatch.setattr(former, "_place", lambda *_: place)
     former._form(8.2, imager, np.ones(1, np.bool_))
-    assert sent["velocity_sigma"][0] == pytest.approx(sigma)
-    assert sent["focused"][0] == float(accepted)
-    own = former._expected_velocity(0, WAVELENGTH)[0]
-    assert sent["velocity"][0] == (7101.0 if accepted else round(own))
+    return former, sent
+
+
+def test_relief_is_part_of_the_velocitys_error(monkeypatch):
+    """600 m of height are 0.28 m/s (V^2 grows by the acceleration times the height over range)."""
+    focus = SimpleNamespace(velocity=7101.0, sigma=0.4, accepted=True, reason="accepted")
+    former, sent = forming(monkeypatch, focus, height_sigma=600.0)
+    sine = WAVELENGTH * 54.0 / (2 * np.linalg.norm(V_E))
+    low, high = (
+        effective_velocity_array(R_E, V_E, ground_point(R_E, V_E, 861013.0, sine, h))
+        for h in (0.0, 600.0)
+    )
+    assert sent["velocity_sigma"][0] == pytest.approx(np.hypot(0.4, high - low), rel=1e-3)
+    assert sent["velocity_sigma"][0] > 0.47
+    assert (sent["velocity"][0], sent["focused"][0]) == (7101.25, 1.0)  # at the beam's center
+    assert former.reason[0] == 0
+    assert sent["reach"] == 50.0  # five standard deviations of 2.5 m/s in whole steps
     assert sent["slant_range"][0] == 861013.0
     speed = np.linalg.norm(V_E)
     assert sent["sine"][0] == pytest.approx(WAVELENGTH * 54.0 / (2 * speed), rel=1e-12)
+    assert (sent["row_time"][0], sent["column_range"][0]) == (2 / 2160.0, 9.4)
+    assert (sent["time_sigma"][0], sent["side"][0]) == (1e-5, 1.0)
+
+
+def test_where_autofocus_refuses_the_velocity_is_the_estimates(monkeypatch):
+    """With its standard error, and the reason."""
+    focus = SimpleNamespace(velocity=7101.0, sigma=0.4, accepted=False, reason=REASONS[4])
+    former, sent = forming(monkeypatch, focus)
+    field, sigma = former._expected_velocity(0, WAVELENGTH)
+    assert sent["focused"][0] == 0.0
+    assert (sent["velocity"][0], sent["velocity_sigma"][0]) == (field.velocity, sigma)
+    assert former.reason[0] == 4
+
+
+def test_an_estimate_without_an_image_is_told_why(monkeypatch):
+    """It goes without one this time: it is not failed, and nothing is sent."""
+    focus = SimpleNamespace(velocity=7101.0, sigma=0.4, accepted=True, reason="accepted")
+    former, sent = forming(monkeypatch, focus)
+    prior = former.prior
+    for change, reason in (
+        ({"r_e": 1.3 * R_E[None]}, BLIND),
+        ({"P": 1e6 * prior.P}, OPEN),
+    ):
+        former.port_views["prior"] = SimpleNamespace(**vars(prior) | change)
+        imager = SimpleNamespace(
+            radar=SimpleNamespace(wavelength=WAVELENGTH, prf=2160.0), migration_step=50.0
+        )
+        sent.clear()
+        former._form(8.2, imager, np.ones(1, np.bool_))
+        assert REASONS[int(former.reason[0])] == reason
+        assert not sent
 
 
 def test_a_fix_states_the_variance_of_what_it_measures():
