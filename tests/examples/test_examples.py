@@ -38,7 +38,7 @@ SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
     **dict.fromkeys(
         ("geolocation", "geolocation_inertial", "geolocation_pass", "geolocation_printed"), "5"
     ),
-    "spacecraft_sar_closed_loop": "4",
+    **dict.fromkeys(("spacecraft_sar_closed_loop", "spacecraft_sar_closed_loop_long"), "4"),
     "spacecraft_sar_real_echo": "4",
 }
 
