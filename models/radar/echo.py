@@ -49,6 +49,8 @@ from terrafix.models.radar.speckle import ARRAY_SPECKLE, Speckle, add_noise, sca
 from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
 _TAPS = 12
+_ALIKE = 0.05
+"""Phase that is left out where one layer stands for all heights [rad]."""
 _SENT = 8
 """Degree of the polynomial of range frequency that tells the phase of a line of Doppler."""
 
@@ -141,8 +143,9 @@ def simulated_echo(
     footprint, grid_lines = illuminated_footprint(arc, acquisition)
     terrain = TerrainGrid(footprint, scene)
     heights = _layer_heights(terrain)
-    layers = scattered(terrain, heights, rng, speckle)
-    _bright_points(layers, terrain, scene, heights)
+    n_layers = 1 if _alike(footprint, heights, acquisition) else 2
+    layers = scattered(terrain, heights, rng, speckle, n_layers)
+    _bright_points([layers[0], layers[-1]], terrain, scene, heights)
     echo = received(layers, heights, footprint, acquisition, grid_lines, operations)
     aperture = acquisition.illuminated / _doppler_rate(footprint)
     noise = np.sqrt(0.5 * radar.n_pulse * aperture * radar.prf * 10 ** (-snr_db / 10))
@@ -195,6 +198,15 @@ def ideal_image(
 
 def _layer_heights(terrain: TerrainGrid) -> tuple[float, float]:
     return float(terrain.height.min()) - 1.0, float(terrain.height.max()) + 1.0
+
+
+def _alike(footprint: Footprint, heights: tuple[float, float], acquisition: Acquisition) -> bool:
+    """Whether one layer in the middle does for two: phases differ by less than `_ALIKE` from it."""
+    low, high = (RangeHistories(footprint, h, acquisition.illuminated) for h in heights)
+    x = np.linspace(*low.domain, 17)
+    cycles = (high.at(x) - low.at(x)) @ chebyshev.chebvander(np.linspace(-1, 1, 5), 4).T
+    wavelength = footprint.radar.wavelength
+    return bool(2 * np.pi * 2 / wavelength * np.abs(cycles).max() / 2 < _ALIKE)
 
 
 def illuminated_footprint(arc: Arc, acquisition: Acquisition) -> tuple[Footprint, int]:
@@ -310,7 +322,7 @@ def received(
     Parameters
     ----------
     layers : list of ndarray of complex64, shape (n_lines, n_cells)
-        Scatterers at the lower and at the upper height; overwritten.
+        Scatterers at the lower and at the upper height, or one layer half way between; overwritten.
     heights : tuple of float
         Of the layers [m].
     footprint : Footprint
@@ -326,7 +338,8 @@ def received(
     frequency = fft.fftfreq(n_lines, 1 / radar.prf)
     frequency += radar.prf * np.rint((acquisition.centroid - frequency) / radar.prf)
     lit = np.abs(frequency - acquisition.centroid) <= acquisition.illuminated / 2
-    histories = [RangeHistories(footprint, h, acquisition.illuminated) for h in heights]
+    own: tuple[float, ...] = heights if len(layers) == 2 else (sum(heights) / 2,)
+    histories = [RangeHistories(footprint, h, acquisition.illuminated) for h in own]
     middle = histories[0]
     # rows that are not lit are zero; the sums of the layers go where the first one was
     spectra = [fft.fft(layer, axis=0, overwrite_x=True, workers=-1) for layer in layers]
@@ -349,10 +362,12 @@ def received(
 
     def compress_inversely(rows: slice) -> ComplexArray:
         x = middle.clipped(radar.wavelength * frequency[rows])
-        low, high = (spectrum[rows] for spectrum in spectra)
-        for part, history in ((low, histories[0]), (high, histories[1])):
+        parts = [spectrum[rows] for spectrum in spectra]
+        for part, history in zip(parts, histories, strict=True):
             operations.turn_by(part, (scale * history.at(x)) @ by_range)
-        low += high
+        low, *others = parts
+        for other in others:
+            low += other
         low *= (weight[rows] * lit[rows]).astype(np.float32)[:, None]
         return low
 

@@ -10,6 +10,7 @@ from terrafix.models.radar.autofocus import SharpnessCurve, autofocus
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT
 from terrafix.models.radar.echo import (
     Acquisition,
+    _alike,
     add_points,
     ideal_image,
     illuminated_footprint,
@@ -19,6 +20,7 @@ from terrafix.models.radar.echo import (
 from terrafix.models.radar.focusing import azimuth_compressed, range_doppler
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.scene import CELL, Scene, brightness
+from terrafix.models.radar.speckle import scattered
 from terrafix.models.sensors.effective_velocity import effective_velocity_array
 
 RANGE = 861013.0  # [m], to the place that the boresight meets
@@ -242,6 +244,23 @@ def test_a_simulated_scene_is_autofocused_at_its_own_velocity(arc, points):
     assert focus.accepted
     assert focus.velocity == pytest.approx(V, abs=0.6)
     assert geodetic(p)[2] == pytest.approx(height, abs=1e-3)
+
+
+def test_one_layer_stands_for_low_relief_alone(arc, points):
+    """Half of 100 m of relief turns the edge of the band by 0.031 rad, half of 300 m by 0.093."""
+    a = acquisition(points, n_lines=300, n_cells=500)
+    footprint, first = illuminated_footprint(arc, a)
+    assert _alike(footprint, (0.0, 100.0), a)
+    assert not _alike(footprint, (0.0, 300.0), a)
+    layers = scattered(
+        TerrainGrid(footprint, Scene(flat_dem(50.0), **PLAIN)),
+        (0.0, 100.0),
+        np.random.default_rng(1),
+    )
+    both = layers[0] + layers[1]
+    two = received(layers, (0.0, 100.0), footprint, a, first)
+    one = received([both], (0.0, 100.0), footprint, a, first)
+    assert np.linalg.norm(one - two) < 1e-3 * np.linalg.norm(two)
 
 
 def test_echo_depends_on_the_generator_alone(arc, points):
