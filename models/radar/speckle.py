@@ -72,7 +72,9 @@ class ArraySpeckle:
         high: ComplexArray | None,
     ) -> None:
         """Write the scatterers of a part of the grid, in two layers."""
-        amplitude, share = terrain.pixels(first, bits.shape)
+        n_lines, n_cells = bits.shape
+        columns = slice(first[1], first[1] + n_cells)
+        amplitude, share = terrain.pixels(first[0], first[0] + n_lines, columns)
         np.multiply(_normal(bits), amplitude, out=low)
         if high is None:
             return

@@ -41,6 +41,7 @@ def terrain():
     own.coarse = np.array(
         [59 * i, 389 * j, 4 * i - 3 * j, 100 + 50 * rng.random(i.shape)], np.float32
     )
+    own._layers, own.folded = [], False  # no layover
     own._interpolated = lambda *a: TerrainGrid._interpolated(own, *a)
     own.pixels = lambda *a: TerrainGrid.pixels(own, *a)
     return own
@@ -81,7 +82,7 @@ def test_scatterers_are_as_bright_as_the_terrain(speckle, terrain):
     np.testing.assert_allclose(low + high, whole, atol=1e-5)
     unit = np.zeros((N, M), np.complex64)
     ARRAY_SPECKLE.add_noise(unit, bits, float(np.sqrt(0.5)))
-    amplitude, height = TerrainGrid.pixels(terrain, (0, 0), (N, M))
+    amplitude, height = TerrainGrid.pixels(terrain, 0, N)
     # places in the texture are held to 1/32 cell, with arrays
     np.testing.assert_allclose(whole / unit, amplitude, rtol=0.03, atol=1e-3)
     np.testing.assert_allclose(high / unit, (height - 90) / 100 * amplitude, rtol=0.03, atol=1e-3)
