@@ -39,10 +39,16 @@ def slope(rise=0.15):
     return Dem(height, np.radians(29.5), np.radians(-95.65), np.radians(1e-3), np.radians(1e-3))
 
 
-def acquisition(points, n_lines=7400, n_cells=1000, centroid=0.0):
+def acquisition(points, n_lines=7400, n_cells=1000, centroid=0.0, **settings):
     near = RANGE - n_cells / 2 * points.PALSAR.range_spacing
     return Acquisition(
-        points.PALSAR, -n_lines / 2 / points.PALSAR.prf, n_lines, n_cells, near, centroid
+        points.PALSAR,
+        -n_lines / 2 / points.PALSAR.prf,
+        n_lines,
+        n_cells,
+        near,
+        centroid,
+        **settings,
     )
 
 
@@ -252,6 +258,8 @@ def test_one_layer_stands_for_low_relief_alone(arc, points):
     footprint, first = illuminated_footprint(arc, a)
     assert _alike(footprint, (0.0, 100.0), a)
     assert not _alike(footprint, (0.0, 300.0), a)
+    a = acquisition(points, n_lines=300, n_cells=500, illuminated=300.0)
+    footprint, first = illuminated_footprint(arc, a)
     layers = scattered(
         TerrainGrid(footprint, Scene(flat_dem(50.0), **PLAIN)),
         (0.0, 100.0),
@@ -264,7 +272,7 @@ def test_one_layer_stands_for_low_relief_alone(arc, points):
 
 
 def test_echo_depends_on_the_generator_alone(arc, points):
-    a = acquisition(points, n_lines=300, n_cells=500)
+    a = acquisition(points, n_lines=300, n_cells=500, illuminated=300.0)
     scene = Scene(flat_dem(), seed=5)
     one, again, other = (
         simulated_echo(scene, arc, a, np.random.default_rng(k)).tobytes() for k in (1, 1, 2)
