@@ -52,6 +52,8 @@ benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/imaging.py
 	$(BIN)/python benchmarks/closed_loop.py
 	$(BIN)/python benchmarks/maps.py
+	$(BIN)/python benchmarks/closed_loop_figures.py
+	$(BIN)/python benchmarks/closed_loop_long.py
 	$(BIN)/python benchmarks/filters.py
 	$(BIN)/python benchmarks/verdicts.py
 	$(BIN)/python benchmarks/aircraft_images.py

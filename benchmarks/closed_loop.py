@@ -90,6 +90,7 @@ def closed_loop(case: str, number: int) -> System:
     system = read_system(SYSTEM, settings=[("case", case)])
     rng = np.random.default_rng([20081, number])
     parts = system.nodes
+    system.dispersions.clear()
     parts["antenna"].misalignment = SIGMA[case] * rng.standard_normal(3)
     parts["orbit"].earth_angle0 = 0.37 * number + 0.001 * rng.random()
     parts["terrain"].surface_seed = 100 + number

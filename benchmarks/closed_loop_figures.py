@@ -14,21 +14,16 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import matplotlib as mpl
 import numpy as np
 
-from terrafix.components.filters.mekf import MekfPredict
-from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.engine.run import simulate
 from terrafix.cosim.files.readers import read_system
 from terrafix.cosim.system.dispersion import Dispersion
 from terrafix.cosim.system.system import System
-from terrafix.models.core.model import Model
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SIGMA = {"TC-1": "0.1 deg", "TC-2": "0.01 deg"}
@@ -38,37 +33,12 @@ STATES = {"position": "m", "velocity": "m/s", "misalignment": "deg"}
 DEGREE = 180 / np.pi
 
 
-class StartedPredict(MekfPredict):
-    """The filter, started with a misalignment that each member takes for true."""
-
-    misalignment0 = Parameter(0.0, shape=(3,), unit="rad", doc="at t = 0, rotation vector")
-
-    def build_model(self) -> Model:
-        """Turn the misalignment that it starts with."""
-        model, angle = super().build_model(), ca.SX.sym("misalignment0", 3)
-        turned = ca.vertcat(angle / 2, 1)
-        return replace(
-            model,
-            parameters={**model.parameters, "misalignment0": angle},
-            initial={**model.initial, "q_mu": turned / ca.norm_2(turned)},
-        )
-
-
-def dispersed(name: str, case: str, **settings: str) -> System:
+def dispersed(name: str, case: str) -> System:
     """A system whose members take other misalignments for true; there is none."""
-    system = read_system(EXAMPLES / name, settings=[("case", case), *settings.items()])
+    system = read_system(EXAMPLES / name, settings=[("case", case)])
     parts = system.nodes
-    old = parts["predict"]
-    new = StartedPredict(
-        **{n: old.setting(n) for n in ("accel_psd", "misalignment_sigma0")}, rate=old.rate
-    )
-    wires = [w for w in system.connections if "predict." in (w.source + " " + w.target)]
-    system.remove("predict")
-    system.add(new, "predict")
-    for wire in wires:
-        system.connect(wire.source, wire.target)
-    parts["antenna"].misalignment = "0 rad"
     parts["antenna"].misalignment_sigma0 = "0 rad"
+    system.dispersions.clear()
     system.disperse(Dispersion("mounting", ("predict.misalignment0",), SIGMA[case]))
     system.records.clear()
     kinds = [f"{state}_{kind}" for state in STATES for kind in ("error", "sigma")]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,19 +18,25 @@ import cv2
 import numpy as np
 from scipy import fft
 
-from terrafix.components.sensors.compiled import row_operations
+from terrafix.components.sensors.compiled import row_operations, speckle_of_bits
 from terrafix.models.core.parallel import batches
 from terrafix.models.images.matching import Searchable, matched
+from terrafix.models.images.reference import earlier_pass
+from terrafix.models.maps.dem import read_jacksboro
+from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.radar.autofocus import SharpnessCurve, autofocus
 from terrafix.models.radar.chirp import Radar, padded_length
 from terrafix.models.radar.doppler import fractional_centroid, unwrapped_centroid
+from terrafix.models.radar.echo import Acquisition, illuminated_footprint, simulated_echo
 from terrafix.models.radar.focusing import (
     RangeDoppler,
     azimuth_compressed,
     azimuth_looks,
     range_doppler,
 )
+from terrafix.models.radar.footprint import Footprint
 from terrafix.models.radar.recordings.files import read_recording
+from terrafix.models.radar.scene import Scene
 from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
 ROOT = Path(__file__).parents[1]
@@ -58,6 +65,15 @@ def seconds(action: Callable[[], object], repeat: int = 5) -> float:
         action()
         found.append(time.process_time() - started)
     return min(found)
+
+
+def peak(action: Callable[[], object]) -> float:
+    """Most that arrays take at a time while something is done [bytes]."""
+    tracemalloc.start()
+    action()
+    found = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return found
 
 
 def speckle(shape: tuple[int, int], seed: int = 0) -> np.ndarray:
@@ -92,7 +108,8 @@ def speed() -> None:
         whole = seconds(processed)
         print(
             f"range-Doppler processor, 1536 x 2048, {name}: {whole:.2f} s of processor, "
-            f"{whole / floor:.1f} x its FFTs (2)"
+            f"{whole / floor:.1f} x its FFTs (2); it and the echo take "
+            f"{1 + peak(processed) / echo.nbytes:.1f} times the echo's memory (4)"
         )
     small = Radar(5.3e9, 1256.98, 32.317e6, -0.72135e12, 1e-6, 0.75 * 1256.98)
     domain = range_doppler(
@@ -110,6 +127,47 @@ def speed() -> None:
         f"autofocus candidate, 1024 x 1024: {one:.3f} s of processor (< 0.15), "
         f"{one / floor:.1f} x its FFT"
     )
+
+
+def simulation() -> None:
+    """Processor time of the echo and of the reference of the closed loop's example."""
+    radar = Radar(1269.768992e6, 2160.0, 16e6, -5.185185185185185e11, 27e-6, 1513.0)
+    r = np.array([-1104646.336, -6096830.387, 3395727.381])
+    v = np.array([-560.098, 3729.587, 6497.936]) - np.cross([0.0, 0.0, 7.292115e-5], r)
+    arc, scene = OrbitArc(r, v, 0.0, 15.0, 15.0), Scene(read_jacksboro().tiled(), seed=1)
+    n_lines, n_cells, far = 7452, 1072, 861013.0
+    near = far - (n_cells - radar.n_pulse) / 2 * radar.range_spacing
+    acquisition = Acquisition(radar, -n_lines / 2 / radar.prf, n_lines, n_cells, near)
+    grid, _ = illuminated_footprint(arc, acquisition)
+    layer = speckle((grid.n_lines, grid.n_cells))
+
+    def transforms() -> None:
+        """Of two layers to Doppler and one back, and of lines there and back."""
+        for _ in range(3):
+            fft.fft(layer, axis=0, overwrite_x=True, workers=-1)
+        for _ in range(2):
+            fft.fft(layer, axis=1, overwrite_x=True, workers=-1)
+        layer[:] = 1
+
+    def echo() -> None:
+        simulated_echo(
+            *(scene, arc, acquisition, np.random.default_rng(1)),
+            operations=row_operations(),
+            speckle=speckle_of_bits(),
+        )
+
+    def reference() -> None:
+        first, nearest = -2400 / radar.prf, far - 750 * radar.range_spacing
+        footprint = Footprint(arc, radar, first, 4800, nearest, 1500, 0.0)
+        earlier_pass(scene, footprint, (2, 1), np.random.default_rng(2), speckle=speckle_of_bits())
+
+    floor, raw = seconds(transforms, 3), 8 * n_lines * n_cells
+    for name, action in (("echo, 7452 x 1072", echo), ("reference, 4800 x 1500", reference)):
+        own = seconds(action, 3)
+        print(
+            f"simulated {name}: {own:.2f} s of processor, {own / floor:.1f} x the FFTs of an echo, "
+            f"{peak(action) / raw:.1f} times the memory of an echo"
+        )
 
 
 def domain_of(name: str) -> RangeDoppler:
@@ -245,6 +303,7 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, default=1)
     arguments = parser.parse_args()
     speed()
+    simulation()
     if (DATA / "radarsat1_vancouver").is_dir():
         chunks = {name: domain_of(name) for name in CHUNKS}
         focusing(chunks, arguments.starts)

@@ -61,6 +61,9 @@ class MekfPredict(SymbolicComponent):
         0.0, unit="rad^2/s", minimum=0.0, doc="process noise of the misalignment"
     )
     misalignment_sigma0 = Parameter(unit="rad", positive=True, doc="at t = 0, per axis")
+    misalignment0 = Parameter(
+        0.0, shape=(3,), unit="rad", frame="s", doc="taken for true at t = 0, rotation vector"
+    )
 
     start = MessageInput(fields=KNOWN_STATE, needed_at_start=True, doc="last known state, at t = 0")
     posterior = MessageInput(fields=ESTIMATE, at="start", doc="corrected estimate")

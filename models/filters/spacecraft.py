@@ -43,7 +43,7 @@ from terrafix.models.filters.process import Process
 from terrafix.models.filters.updates import Measurement
 from terrafix.models.geometry.antenna import nominal_antenna
 from terrafix.models.geometry.frames import earth_rate_cross
-from terrafix.models.geometry.quaternion import rotation_matrix
+from terrafix.models.geometry.quaternion import from_rotation_vector, rotation_matrix
 from terrafix.models.motion.gravity import gravity_acceleration
 from terrafix.models.motion.satellite import Forces, central_gravity, further_gravity
 from terrafix.models.motion.surroundings import SIZES, Surroundings, surroundings_at
@@ -86,20 +86,27 @@ def mekf_predict_model(
         ``.P`` (9, 9) and the flag ``posterior.fresh``, which makes the step begin there; for the
         start alone ``start.r_e``, ``start.v_e``, ``start.P`` (6, 6). Parameters ``mu``, ``radius``,
         ``j2``, ``rotation_rate``, ``accel_psd`` [m^2/s^3], ``misalignment_psd`` [rad^2/s],
-        ``misalignment_sigma0`` [rad]. Outputs ``prior.r_e``, ``.v_e``, ``.q_mu``, ``.P``.
+        ``misalignment_sigma0`` [rad], ``misalignment0`` (3,) [rad]: what it is taken for at the
+        start, a rotation vector. Outputs ``prior.r_e``, ``.v_e``, ``.q_mu``, ``.P``.
 
     Raises
     ------
     ValueError
         If a choice is not known.
     """
-    return predict_model(
+    model = predict_model(
         "mekf_predict",
         STATE,
         spacecraft_process(gravity, transition),
         told=("r_e", "v_e"),
         sigmas={"q_mu": "misalignment_sigma0"},
         smoothed=smoothed,
+    )
+    known = ca.SX.sym("misalignment0", 3)
+    return replace(
+        model,
+        parameters={**model.parameters, "misalignment0": known},
+        initial={**model.initial, "q_mu": from_rotation_vector(known)},
     )
 
 

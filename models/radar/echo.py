@@ -32,6 +32,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,10 +46,20 @@ from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Radar, chirp_replica, un
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
 from terrafix.models.radar.history import RangeHistories, range_derivatives
 from terrafix.models.radar.scene import Scene
-from terrafix.models.radar.speckle import ARRAY_SPECKLE, Speckle, add_noise, scattered
+from terrafix.models.radar.speckle import (
+    ARRAY_SPECKLE,
+    Speckle,
+    add_noise,
+    scattered,
+    scattered_columns,
+)
 from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
 _TAPS = 12
+_COLUMNS = 64
+"""Columns whose scatterers are made, and transformed to Doppler, at a time."""
+_ALIKE = 0.05
+"""Phase that is left out where one layer stands for all heights [rad]."""
 _SENT = 8
 """Degree of the polynomial of range frequency that tells the phase of a line of Doppler."""
 
@@ -144,9 +155,18 @@ def simulated_echo(
     footprint, grid_lines = illuminated_footprint(arc, acquisition)
     terrain = TerrainGrid(footprint, scene)
     heights = _layer_heights(terrain)
-    layers = scattered(terrain, heights, rng, speckle)
-    _bright_points(layers, terrain, scene, heights)
-    echo = received(layers, heights, footprint, acquisition, grid_lines, operations)
+    n_layers = 1 if _alike(footprint, heights, acquisition) else 2
+    points = _bright_points(terrain, scene, heights)
+    streams = rng.spawn(-(-footprint.n_cells // _COLUMNS))
+
+    def scatterers(columns: slice) -> list[ComplexArray]:
+        stream = streams[columns.start // _COLUMNS]
+        layers = scattered_columns(terrain, columns, heights, stream, speckle, n_layers)
+        points.add([layers[0], layers[-1]], columns)
+        return layers
+
+    own = heights if n_layers == 2 else (sum(heights) / 2,)
+    echo = _received(scatterers, own, footprint, acquisition, grid_lines, operations)
     aperture = acquisition.illuminated / _doppler_rate(footprint)
     noise = np.sqrt(0.5 * radar.n_pulse * aperture * radar.prf * 10 ** (-snr_db / 10))
     add_noise(echo, float(noise), rng, speckle)
@@ -184,7 +204,7 @@ def ideal_image(
     footprint, radar = terrain.footprint, terrain.footprint.radar
     heights = _layer_heights(terrain)
     (image,) = scattered(terrain, heights, rng, speckle, n_layers=1)
-    _bright_points([image, image], terrain, scene, heights)
+    _bright_points(terrain, scene, heights).add([image, image], slice(0, footprint.n_cells))
     add_noise(image, float(np.sqrt(0.5 * 10 ** (-snr_db / 10))), rng, speckle)
     spectrum = fft.fft2(image, overwrite_x=True, workers=-1)
     f = fft.fftfreq(footprint.n_lines, 1 / radar.prf)
@@ -198,6 +218,15 @@ def ideal_image(
 
 def _layer_heights(terrain: TerrainGrid) -> tuple[float, float]:
     return float(terrain.height.min()) - 1.0, float(terrain.height.max()) + 1.0
+
+
+def _alike(footprint: Footprint, heights: tuple[float, float], acquisition: Acquisition) -> bool:
+    """Whether one layer in the middle does for two: phases differ by less than `_ALIKE` from it."""
+    low, high = (RangeHistories(footprint, h, acquisition.illuminated) for h in heights)
+    x = np.linspace(*low.domain, 17)
+    cycles = (high.at(x) - low.at(x)) @ chebyshev.chebvander(np.linspace(-1, 1, 5), 4).T
+    wavelength = footprint.radar.wavelength
+    return bool(2 * np.pi * 2 / wavelength * np.abs(cycles).max() / 2 < _ALIKE)
 
 
 def illuminated_footprint(arc: Arc, acquisition: Acquisition) -> tuple[Footprint, int]:
@@ -233,23 +262,13 @@ def _doppler_rate(footprint: Footprint) -> float:
     )
 
 
-def _bright_points(
-    layers: list[ComplexArray],
-    terrain: TerrainGrid,
-    scene: Scene,
-    heights: tuple[float, float],
-) -> None:
-    """Add the scene's bright points between the pixels."""
+def _bright_points(terrain: TerrainGrid, scene: Scene, heights: tuple[float, float]) -> _Points:
+    """The scene's bright points, between the pixels."""
     latitude, longitude, amplitude, phase = scene.points(*terrain.cells)
     height = scene.dem.at(latitude, longitude)
-    add_points(
-        layers,
-        terrain.footprint,
-        terrain.footprint.ground.point(latitude, longitude, height),
-        height,
-        amplitude * np.exp(2j * np.pi * phase),
-        heights,
-    )
+    p = terrain.footprint.ground.point(latitude, longitude, height)
+    reflection = amplitude * np.exp(2j * np.pi * phase)
+    return _Points(terrain.footprint, p, height, reflection, heights)
 
 
 def add_points(
@@ -276,25 +295,48 @@ def add_points(
     heights : tuple of float
         Of the layers [m].
     """
-    radar = footprint.radar
-    line, cell = footprint.place(p)
-    shape = layers[0].shape
-    half = _TAPS // 2
-    i, j = np.floor(line).astype(np.intp), np.floor(cell).astype(np.intp)
-    inside = (i >= half - 1) & (i < shape[0] - half) & (j >= half - 1) & (j < shape[1] - half)
-    i, j, line, cell = i[inside], j[inside], line[inside], cell[inside]
-    taps = np.arange(1 - half, half + 1)
-    distance = footprint.near_range + cell * radar.range_spacing
-    # in lines from the point, about the beam's Doppler frequency; in cells, about baseband
-    dy, dx = (i - line)[:, None] + taps, (j - cell)[:, None] + taps
-    along = _interpolator(dy) * unit_phasor(footprint.centroid / radar.prf * dy)
-    carrier = unit_phasor(-2 * distance / radar.wavelength)
-    patch = (reflection[inside] * carrier)[:, None, None] * along[:, :, None]
-    patch = patch * _interpolator(dx)[:, None, :]
-    at = (i[:, None, None] + taps[:, None], j[:, None, None] + taps)
-    share = ((height[inside] - heights[0]) / (heights[1] - heights[0]))[:, None, None]
-    np.add.at(layers[0], at, ((1 - share) * patch).astype(np.complex64))
-    np.add.at(layers[1], at, (share * patch).astype(np.complex64))
+    points = _Points(footprint, p, height, reflection, heights)
+    points.add(layers, slice(0, footprint.n_cells))
+
+
+class _Points:
+    """Point scatterers on the grid of a footprint, as of `add_points`."""
+
+    def __init__(
+        self,
+        footprint: Footprint,
+        p: FloatArray,
+        height: FloatArray,
+        reflection: ComplexArray,
+        heights: tuple[float, float],
+    ) -> None:
+        radar, half = footprint.radar, _TAPS // 2
+        line, cell = footprint.place(p)
+        i, j = np.floor(line).astype(np.intp), np.floor(cell).astype(np.intp)
+        inside = (i >= half - 1) & (i < footprint.n_lines - half)
+        inside &= (j >= half - 1) & (j < footprint.n_cells - half)
+        self.i, self.j, line, cell = i[inside], j[inside], line[inside], cell[inside]
+        self.taps = np.arange(1 - half, half + 1)
+        distance = footprint.near_range + cell * radar.range_spacing
+        # in lines from the point, about the beam's Doppler frequency; in cells, about baseband
+        dy, dx = ((a - b)[:, None] + self.taps for a, b in ((self.i, line), (self.j, cell)))
+        along = _interpolator(dy) * unit_phasor(footprint.centroid / radar.prf * dy)
+        carrier = unit_phasor(-2 * distance / radar.wavelength)
+        self.along = (reflection[inside] * carrier)[:, None] * along
+        self.across = _interpolator(dx)
+        share = (height[inside] - heights[0]) / (heights[1] - heights[0])
+        self.shares = 1 - share, share
+
+    def add(self, layers: list[ComplexArray], columns: slice) -> None:
+        """Add them to some columns of the grids of the two layers."""
+        near = (self.j + self.taps[-1] >= columns.start) & (self.j + self.taps[0] < columns.stop)
+        at = self.i[near, None, None] + self.taps[:, None], self.j[near, None, None] + self.taps
+        i, j = np.broadcast_arrays(*at)
+        own = (j >= columns.start) & (j < columns.stop)
+        patch = (self.along[near, :, None] * self.across[near, None, :])[own]
+        for layer, share in zip(layers, self.shares, strict=True):
+            weight = np.broadcast_to(share[near, None, None], own.shape)[own]
+            np.add.at(layer, (i[own], j[own] - columns.start), (weight * patch).astype(layer.dtype))
 
 
 def _interpolator(x: FloatArray) -> FloatArray:
@@ -315,7 +357,7 @@ def received(
     Parameters
     ----------
     layers : list of ndarray of complex64, shape (n_lines, n_cells)
-        Scatterers at the lower and at the upper height; overwritten.
+        Scatterers at the lower and at the upper height, or one layer half way between.
     heights : tuple of float
         Of the layers [m].
     footprint : Footprint
@@ -326,40 +368,61 @@ def received(
     operations : Rows
         Who turns and resamples rows.
     """
+    own = heights if len(layers) == 2 else (sum(heights) / 2,)
+
+    def scatterers(columns: slice) -> list[ComplexArray]:
+        return [np.ascontiguousarray(layer[:, columns]) for layer in layers]
+
+    return _received(scatterers, own, footprint, acquisition, first_line, operations)
+
+
+def _received(
+    scatterers: Callable[[slice], list[ComplexArray]],
+    heights: tuple[float, ...],
+    footprint: Footprint,
+    acquisition: Acquisition,
+    first_line: int,
+    operations: Rows,
+) -> ComplexArray:
+    """Echo of layers at some heights, which are made for a few columns at a time."""
     radar = acquisition.radar
-    n_lines, n_cells = layers[0].shape
+    n_lines, n_cells = footprint.n_lines, footprint.n_cells
     frequency = fft.fftfreq(n_lines, 1 / radar.prf)
     frequency += radar.prf * np.rint((acquisition.centroid - frequency) / radar.prf)
     lit = np.abs(frequency - acquisition.centroid) <= acquisition.illuminated / 2
     histories = [RangeHistories(footprint, h, acquisition.illuminated) for h in heights]
     middle = histories[0]
-    # rows that are not lit are zero; the sums of the layers go where the first one was
-    spectra = [fft.fft(layer, axis=0, overwrite_x=True, workers=-1) for layer in layers]
-    total = spectra[0]
-    total[~lit] = 0
     speed = float(np.linalg.norm(footprint.arc.velocity(footprint.middle[0])))
     rate = _doppler_rate(footprint)
     beam = np.sinc(acquisition.antenna_length * (frequency - acquisition.centroid) / (2 * speed))
-    weight = beam**2 * radar.prf / np.sqrt(rate)
+    weight = (lit * beam**2 * radar.prf / np.sqrt(rate)).astype(np.float32)
     cells = np.arange(n_cells)
     ranges = np.asarray(footprint.near_range + cells * radar.range_spacing, np.float64)
     by_range = chebyshev.chebvander(_scaled_to(ranges, middle.span), 4).T
     scale = 2 / radar.wavelength
+    x = middle.clipped(radar.wavelength * frequency)
+    turns = [scale * history.at(x) for history in histories]
+    # rows that are not lit stay zero
+    total = np.zeros((n_lines, n_cells), np.complex64)
 
+    def compress_inversely(columns: slice) -> None:
+        parts = [fft.fft(part, axis=0, overwrite_x=True) for part in scatterers(columns)]
+        for rows in batches(n_lines, 256):
+            if not lit[rows].any():
+                continue
+            low, *others = (part[rows] for part in parts)
+            for part, turn in zip((low, *others), turns, strict=True):
+                operations.turn_by(part, turn[rows] @ by_range[:, columns])
+            for other in others:
+                low += other
+            np.multiply(low, weight[rows, None], out=total[rows, columns])
+
+    over(batches(n_cells, _COLUMNS), compress_inversely)
     pulse = fft.fft(chirp_replica(radar), n_cells).astype(np.complex64) * unit_phasor(-0.125)
     stretch, origin = _migration(radar.wavelength * frequency, middle, ranges)
     by_cell = chebyshev.chebvander(fft.fftfreq(n_cells, 0.5), _SENT).T
     nodes = radar.sample_rate / 2 * chebyshev.chebpts1(_SENT + 1)
     to_coefficients = np.linalg.inv(chebyshev.chebvander(chebyshev.chebpts1(_SENT + 1), _SENT)).T
-
-    def compress_inversely(rows: slice) -> ComplexArray:
-        x = middle.clipped(radar.wavelength * frequency[rows])
-        low, high = (spectrum[rows] for spectrum in spectra)
-        for part, history in ((low, histories[0]), (high, histories[1])):
-            operations.turn_by(part, (scale * history.at(x)) @ by_range)
-        low += high
-        low *= (weight[rows] * lit[rows]).astype(np.float32)[:, None]
-        return low
 
     def send(spectrum: ComplexArray, rows: slice) -> None:
         f = np.where(lit[rows], frequency[rows], acquisition.centroid)[:, None]
@@ -371,7 +434,7 @@ def received(
 
     def receive(rows: slice) -> None:
         # ranges other than the middle one move by what their migration differs from its
-        part = operations.stretched(compress_inversely(rows), origin, -stretch[rows])
+        part = operations.stretched(total[rows], origin, -stretch[rows])
         part = fft.fft(part, axis=1, overwrite_x=True)
         send(part, rows)
         total[rows] = fft.ifft(part, axis=1, overwrite_x=True)

@@ -146,23 +146,24 @@ class TerrainGrid:
         n_i, n_j = self.latitude.shape
         return COARSE[0] * np.arange(n_i, dtype=float), COARSE[1] * np.arange(n_j, dtype=float)
 
-    def pixels(self, start: int, stop: int) -> tuple[Single, Single]:
-        """Mean amplitude and terrain height [m] of every pixel of some lines, (stop - start, n).
+    def pixels(self, start: int, stop: int, columns: slice = slice(None)) -> tuple[Single, Single]:
+        """Mean amplitude and terrain height [m] of pixels of some lines and columns.
 
         Without bright points and speckle.
         """
-        i, j, db, height = (self._interpolated(a, start, stop) for a in self.coarse)
+        i, j, db, height = (self._interpolated(a, start, stop, columns) for a in self.coarse)
         db += cv2.remap(self.texture, j, i, cv2.INTER_LINEAR)
         db *= np.float32(np.log(10) / 20)
         return np.exp(db, out=db), height
 
-    def _interpolated(self, coarse: Single, start: int, stop: int) -> Single:
-        """Linear interpolation of coarse values to all cells of some lines."""
+    def _interpolated(self, coarse: Single, start: int, stop: int, columns: slice) -> Single:
+        """Linear interpolation of coarse values to some lines and columns."""
+        first, last, _ = columns.indices(self.footprint.n_cells)
         by_line, by_cell = (1 / step for step in COARSE)
-        places = np.array([[by_cell, 0.0, 0.0], [0.0, by_line, start * by_line]])
+        places = np.array([[by_cell, 0.0, first * by_cell], [0.0, by_line, start * by_line]])
         # places are multiples of a 16th, which OpenCV's fixed point holds exactly
-        size = (self.footprint.n_cells, stop - start)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        size = (last - first, stop - start)
         fine = cv2.warpAffine(coarse, places, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(fine)
 

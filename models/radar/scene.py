@@ -399,10 +399,11 @@ def _smoothed_noise(seed: int, name: str, rows: range, columns: range, sigma: fl
 
     over(range(wide[0].start // _BLOCK, -(-wide[0].stop // _BLOCK)), fill)
     kernel = cv2.getGaussianKernel(2 * m + 1, sigma, cv2.CV_64F)
-    smooth = cv2.sepFilter2D(out, cv2.CV_32F, kernel, kernel)[m:-m, m:-m]
+    filtered = cv2.sepFilter2D(out, cv2.CV_32F, kernel, kernel)
+    smooth = np.asarray(filtered, np.float32)[m:-m, m:-m]
     smooth -= np.float32(127.5)
     smooth *= np.float32(1 / (np.sqrt((256**2 - 1) / 12) * np.sum(kernel**2)))
-    return np.asarray(smooth)
+    return smooth
 
 
 def _cubic_weights() -> Single:

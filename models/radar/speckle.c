@@ -15,7 +15,7 @@
 
 EXPORT const char terrafix_key[] = TERRAFIX_KEY;
 
-#define BLOCK 256
+#define BLOCK 64
 #define STEP 4
 #define LOG2_10_OF_20 0.166096405f
 
@@ -106,11 +106,11 @@ static inline float within(float x, float last)
 
 /* Values between those of two coarse lines, to coarse cells. */
 static void between_lines(
-    const float *values, int64_t n_j, float line, int64_t last, float *between)
+    const float *values, int64_t n_j, int64_t n_own, float line, int64_t last, float *between)
 {
     const int64_t i = (int64_t)line < last ? (int64_t)line : last;
     const float u = line - (float)i, *near = values + i * n_j, *far = near + n_j;
-    for (int64_t j = 0; j < n_j; j++)
+    for (int64_t j = 0; j < n_own; j++)
         between[j] = near[j] + u * (far[j] - near[j]);
 }
 
@@ -125,28 +125,31 @@ static inline void between_cells(const float *coarse, int n, float *fine)
 }
 
 /*
- * Scatterers of lines `first` to first + n_lines, n_cells each, in two layers.
+ * Scatterers of lines `first` to first + n_lines, of n_cells from `first_cell` on, in two layers.
  *
  * `coarse` (4, n_i, n_j) holds at every `line_step`-th line and STEP-th cell the row and the
  * column in `texture` (n_rows, n_columns; rows lie row_length apart), the brightness [dB] that is added to it, and the
  * height, from which the share of the upper layer is (height - low_height) * per_height.
- * `between` is room for 4 (n_j + BLOCK). A `high` of NULL: all goes to `low`.
+ * `between` is room for 4 (n_j + BLOCK), first_cell a multiple of STEP. A `high` of NULL: all
+ * goes to `low`.
  */
 EXPORT void terrafix_scatter(
-    int64_t first, int64_t n_lines, int64_t n_cells, int64_t line_step, int64_t n_i, int64_t n_j,
-    const float *coarse, int64_t n_rows, int64_t n_columns, int64_t row_length,
+    int64_t first, int64_t n_lines, int64_t first_cell, int64_t n_cells, int64_t line_step,
+    int64_t n_i, int64_t n_j, const float *coarse, int64_t n_rows, int64_t n_columns, int64_t row_length,
     const float *texture, float low_height, float per_height, const uint64_t *bits,
     float *between, float *low, float *high)
 {
-    const int64_t padded = n_j + BLOCK;
+    const int64_t offset = first_cell / STEP, left = n_j - offset;
+    const int64_t wanted = (n_cells + STEP - 1) / STEP + 1, n_own = wanted < left ? wanted : left;
+    const int64_t padded = n_own + BLOCK;
     memset(between, 0, (size_t)(4 * padded) * sizeof *between);
     for (int64_t line = 0; line < n_lines; line++) {
         for (int k = 0; k < 4; k++) {
             float *own = between + k * padded;
-            between_lines(coarse + k * n_i * n_j, n_j,
+            between_lines(coarse + k * n_i * n_j + offset, n_j, n_own,
                           (float)(first + line) / (float)line_step, n_i - 2, own);
-            for (int64_t j = n_j; j < padded; j++)
-                own[j] = own[n_j - 1];
+            for (int64_t j = n_own; j < padded; j++)
+                own[j] = own[n_own - 1];
         }
         for (int64_t start = 0; start < n_cells; start += BLOCK) {
             const int n = (int)(n_cells - start < BLOCK ? n_cells - start : BLOCK);

@@ -32,7 +32,7 @@ Bits = NDArray[np.uint64]
 
 _ROWS = 64
 """Rows that a thread draws at a time, from a stream of random numbers of their own."""
-_BLOCK = 256
+_BLOCK = 64
 """Cells that are looked up at a time, as in speckle.c."""
 
 
@@ -42,14 +42,15 @@ class Speckle(Protocol):
     def scatter(
         self,
         terrain: TerrainGrid,
-        start: int,
+        first: tuple[int, int],
         bits: Bits,
         heights: tuple[float, float],
         low: ComplexArray,
         high: ComplexArray | None,
     ) -> None:
-        """Write the scatterers of lines from `start` on, (n, n_cells), in two layers.
+        """Write the scatterers from a first line and cell on, (n, m), in two layers.
 
+        The first cell is one at which terrain is looked up, a multiple of four.
         They are shared in the proportion in which the terrain lies between the layers' heights
         [m]; without an upper layer, all of them are in the lower one.
         """
@@ -64,14 +65,16 @@ class ArraySpeckle:
     def scatter(
         self,
         terrain: TerrainGrid,
-        start: int,
+        first: tuple[int, int],
         bits: Bits,
         heights: tuple[float, float],
         low: ComplexArray,
         high: ComplexArray | None,
     ) -> None:
-        """Write the scatterers of some lines, in two layers."""
-        amplitude, share = terrain.pixels(start, start + len(bits))
+        """Write the scatterers of a part of the grid, in two layers."""
+        n_lines, n_cells = bits.shape
+        columns = slice(first[1], first[1] + n_cells)
+        amplitude, share = terrain.pixels(first[0], first[0] + n_lines, columns)
         np.multiply(_normal(bits), amplitude, out=low)
         if high is None:
             return
@@ -122,7 +125,7 @@ class CompiledSpeckle:
         pointer, count, real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_float
         self._scatter: Any = library["terrafix_scatter"]
         self._scatter.argtypes = [
-            *[count] * 6,
+            *[count] * 7,
             *(pointer, count, count, count, pointer, real, real),
             *[pointer] * 4,
         ]
@@ -134,24 +137,26 @@ class CompiledSpeckle:
     def scatter(
         self,
         terrain: TerrainGrid,
-        start: int,
+        first: tuple[int, int],
         bits: Bits,
         heights: tuple[float, float],
         low: ComplexArray,
         high: ComplexArray | None,
     ) -> None:
-        """Write the scatterers of some lines, in two layers."""
+        """Write the scatterers of a part of the grid, in two layers."""
         n_lines, n_cells = bits.shape
         _require_whole(bits, low, *([] if high is None else [high]))
         coarse, texture = terrain.coarse, terrain.texture
         if texture.strides[1] != texture.itemsize:
             texture = np.ascontiguousarray(texture)
         n_i, n_j = coarse.shape[1:]
-        if start < 0 or (start + n_lines - 1) > COARSE[0] * (n_i - 1) or COARSE[1] != 4:
-            raise ValueError(f"lines {start} to {start + n_lines - 1} are not of the terrain")
+        last = first[0] + n_lines - 1, first[1] + n_cells - 1
+        covered = COARSE[0] * (n_i - 1), COARSE[1] * (n_j - 1)
+        if min(first) < 0 or first[1] % COARSE[1] or last[0] > covered[0] or last[1] > covered[1]:
+            raise ValueError(f"lines and cells {first} to {last} are not of the terrain")
         between = np.empty((4, n_j + _BLOCK), np.float32)
         self._scatter(
-            *(start, n_lines, n_cells, COARSE[0], n_i, n_j, coarse.ctypes.data),
+            *(first[0], n_lines, first[1], n_cells, COARSE[0], n_i, n_j, coarse.ctypes.data),
             *(*texture.shape, texture.strides[0] // texture.itemsize, texture.ctypes.data),
             *(heights[0], 1 / (heights[1] - heights[0])),
             *(bits.ctypes.data, between.ctypes.data, low.ctypes.data),
@@ -165,7 +170,9 @@ class CompiledSpeckle:
 
 
 def _require_whole(bits: Bits, *rows: ComplexArray) -> None:
-    for array, kind in ((bits, np.uint64), *((r, np.complex64) for r in rows)):
+    arrays: list[tuple[NDArray[Any], type]] = [(bits, np.uint64)]
+    arrays += [(own, np.complex64) for own in rows]
+    for array, kind in arrays:
         if array.dtype != kind or array.shape != bits.shape or not array.flags.c_contiguous:
             raise ValueError(
                 f"{array.dtype} of shape {array.shape} where whole rows of "
@@ -211,9 +218,27 @@ def scattered(
     def add(part: tuple[slice, np.random.Generator]) -> None:
         own, stream = part
         low, high = layers[0][own], layers[1][own] if n_layers == 2 else None
-        speckle.scatter(terrain, own.start, random_bits(stream, low.shape), heights, low, high)
+        speckle.scatter(terrain, (own.start, 0), random_bits(stream, low.shape), heights, low, high)
 
     over(streams(rng, shape[0]), add)
+    return layers
+
+
+def scattered_columns(
+    terrain: TerrainGrid,
+    columns: slice,
+    heights: tuple[float, float],
+    rng: np.random.Generator,
+    speckle: Speckle = ARRAY_SPECKLE,
+    n_layers: int = 2,
+) -> list[ComplexArray]:
+    """Speckle as of `scattered`, of some columns and of one stream."""
+    shape = terrain.footprint.n_lines, columns.stop - columns.start
+    layers = [np.empty(shape, np.complex64) for _ in range(n_layers)]
+    for own in batches(shape[0], 8 * _ROWS):
+        low, high = layers[0][own], layers[1][own] if n_layers == 2 else None
+        bits = random_bits(rng, low.shape)
+        speckle.scatter(terrain, (own.start, columns.start), bits, heights, low, high)
     return layers
 
 

@@ -38,7 +38,9 @@ SHORTER = {  # [s], whose images test_closed_loop forms, or tests/systems
     **dict.fromkeys(
         ("geolocation", "geolocation_inertial", "geolocation_pass", "geolocation_printed"), "5"
     ),
-    **dict.fromkeys(("spacecraft_sar_closed_loop", "spacecraft_sar_rendered"), "4"),
+    **dict.fromkeys(
+        (f"spacecraft_sar_{k}" for k in ("closed_loop", "closed_loop_long", "rendered")), "4"
+    ),
     "spacecraft_sar_real_echo": "4",
 }
 

@@ -41,6 +41,7 @@ def terrain():
     own.coarse = np.array(
         [59 * i, 389 * j, 4 * i - 3 * j, 100 + 50 * rng.random(i.shape)], np.float32
     )
+    own._layers, own.folded = [], False  # no layover
     own._interpolated = lambda *a: TerrainGrid._interpolated(own, *a)
     own.pixels = lambda *a: TerrainGrid.pixels(own, *a)
     return own
@@ -76,8 +77,8 @@ def test_scatterers_are_as_bright_as_the_terrain(speckle, terrain):
     """Amplitude is the terrain's between its points, the upper layer's share its height's."""
     bits = random_bits(np.random.default_rng(3), (N, M))
     low, high, whole = (np.empty((N, M), np.complex64) for _ in range(3))
-    speckle.scatter(terrain, 0, bits, (90.0, 190.0), low, high)
-    speckle.scatter(terrain, 0, bits, (90.0, 190.0), whole, None)
+    speckle.scatter(terrain, (0, 0), bits, (90.0, 190.0), low, high)
+    speckle.scatter(terrain, (0, 0), bits, (90.0, 190.0), whole, None)
     np.testing.assert_allclose(low + high, whole, atol=1e-5)
     unit = np.zeros((N, M), np.complex64)
     ARRAY_SPECKLE.add_noise(unit, bits, float(np.sqrt(0.5)))
@@ -93,10 +94,19 @@ def test_some_lines_are_the_same_as_of_all(speckle, terrain):
     stream = np.random.default_rng(4).spawn(2)[1]
     bits = random_bits(stream, (N - 64, M))
     low, high = (np.empty(bits.shape, np.complex64) for _ in range(2))
-    speckle.scatter(terrain, 64, bits, (90.0, 190.0), low, high)
+    speckle.scatter(terrain, (64, 0), bits, (90.0, 190.0), low, high)
     for own, other, part in zip(layers, again, (low, high), strict=True):
         assert own.tobytes() == other.tobytes()
         assert own[64:].tobytes() == part.tobytes()
+
+
+def test_some_columns_are_as_bright_as_among_all(speckle, terrain):
+    bits = random_bits(np.random.default_rng(5), (N, M))
+    whole, part = np.empty((N, M), np.complex64), np.empty((N, 100), np.complex64)
+    speckle.scatter(terrain, (0, 0), bits, (0.0, 1.0), whole, None)
+    own = np.ascontiguousarray(bits[:, 200:300])
+    speckle.scatter(terrain, (0, 200), own, (0.0, 1.0), part, None)
+    np.testing.assert_allclose(part, whole[:, 200:300], rtol=1e-5)
 
 
 def test_what_is_not_whole_is_refused(terrain):
@@ -108,5 +118,5 @@ def test_what_is_not_whole_is_refused(terrain):
     bits, rows = np.zeros((4, 8), np.uint64), np.zeros((4, 16), np.complex64)
     with pytest.raises(ValueError, match="where whole rows of complex64"):
         found.add_noise(rows[:, ::2], bits, 1.0)
-    with pytest.raises(ValueError, match="lines 90 to 93 are not of the terrain"):
-        found.scatter(terrain, 90, bits, (0.0, 1.0), rows[:, :8].copy(), None)
+    with pytest.raises(ValueError, match=r"cells \(90, 0\) to \(93, 7\) are not of the terrain"):
+        found.scatter(terrain, (90, 0), bits, (0.0, 1.0), rows[:, :8].copy(), None)
