@@ -6,15 +6,18 @@ that estimate. Members whose estimates lead to the same focus share the image.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from terrafix.components.fields import ACQUISITION, ECHO, ESTIMATE, IMAGE, RADAR
+from terrafix.components.images.margins import foreseen_image
 from terrafix.components.sensors.compiled import row_operations
 from terrafix.components.shared import require_common
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.component import Component, FedBy
 from terrafix.cosim.declare.parameters import Count, Flag, Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -84,6 +87,10 @@ class ImageFormer(Component):
         (None, None), dtype=np.float32, doc="the first member's, as its estimate alone forms it"
     )
     image = MessageOutput(fields=IMAGE, doc="which image is a member's, and what it measures")
+
+    def foreseen(self, fed_by: FedBy) -> Iterator[str]:
+        """Tell what echo and autofocus have to spare for the image."""
+        return foreseen_image(self, fed_by)
 
     def initialize(self) -> None:
         """Look whether what forms images is common to all members."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from terrafix.components.fields import ESTIMATE, FIX, IMAGE
+from terrafix.components.images.margins import foreseen_match
 from terrafix.components.images.reference import OnReference
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import FedBy
 from terrafix.cosim.declare.parameters import Choice, Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -55,6 +59,10 @@ class ImageMatcher(OnReference):
     match_place = Output((2,), labels=("row", "column"), doc="of its center on the reference")
     inliers = SharedOutput((None, 4), doc="features of the first image and of the reference")
     outline = SharedOutput((4, 2), doc="corners of the first image on it; NaN if not found")
+
+    def foreseen(self, fed_by: FedBy) -> Iterator[str]:
+        """Tell what the reference has to spare for the image."""
+        return foreseen_match(self, fed_by)
 
     def _step_impl(self, t: float, dt: float) -> None:
         fresh = self.image.fresh & self.environment.active

@@ -20,7 +20,7 @@ from terrafix.cosim.basics.errors import (
     WiringError,
 )
 from terrafix.cosim.basics.units import check_unit, conversion_factor
-from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.component import Component, FedBy
 from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.show.tables import Block, Shown
@@ -129,10 +129,15 @@ def check(system: Flattened, *, duration: Fraction | None = None, outside: bool 
         order.extend(stepping_order(flat))
 
     attempt(find_order)
+    foreseen: list[str] = []
+    if not problems:
+        fed_by = _feeding_components(flat)
+        for path, component in flat.components.items():
+            attempt(lambda p=path, c=component: foreseen.extend(_foreseen(p, c, fed_by)))  # type: ignore[misc]
     if problems:
         raise SystemCheckError(system.name, _once(problems))
     start = starting_order(flat, order)
-    notes = [*system.notes, *_notes(flat), *_starting_notes(start)]
+    notes = [*system.notes, *_notes(flat), *_starting_notes(start), *foreseen]
     return Plan(flat, order, base, grid, notes, start, system.epoch)
 
 
@@ -165,6 +170,18 @@ def _component_problems(
             action()
         except TerrafixError as error:
             yield error
+
+
+def _feeding_components(flat: FlatSystem) -> FedBy:
+    """Which component drives an input of another."""
+    paths = {id(component): path for path, component in flat.components.items()}
+    sources = {c.target: flat.components[flat.owner(c.source)] for c in flat.connections}
+    return lambda component, port: sources.get(f"{paths[id(component)]}.{port}")
+
+
+def _foreseen(path: str, component: Component, fed_by: FedBy) -> Iterator[str]:
+    for note in component.foreseen(fed_by):
+        yield f"'{path}': {note}"
 
 
 def _once(problems: list[TerrafixError]) -> list[TerrafixError]:
