@@ -15,6 +15,7 @@ import numpy as np
 
 from terrafix.components.images.reference import EarlierPass
 from terrafix.components.sensors.echo import SceneEcho
+from terrafix.components.shared import foreseen_side
 from terrafix.components.truth.orbit import OrbitTruth
 from terrafix.cosim.basics.arrays import FloatArray
 from terrafix.cosim.basics.errors import ConfigurationError
@@ -120,6 +121,7 @@ def foreseen_image(former: Component, fed_by: FedBy) -> Iterator[str]:
     ConfigurationError
         If its image does not fit into the echo, or memory is short.
     """
+    yield from foreseen_side(former, fed_by(former, "acquired"))
     view = view_of(former, fed_by)
     if view is None:
         return

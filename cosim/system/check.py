@@ -130,7 +130,7 @@ def check(system: Flattened, *, duration: Fraction | None = None, outside: bool 
 
     attempt(find_order)
     foreseen: list[str] = []
-    if not problems:
+    if not problems and not any(map(_refused, flat.components.values())):
         fed_by = _feeding_components(flat)
         for path, component in flat.components.items():
             attempt(lambda p=path, c=component: foreseen.extend(_foreseen(p, c, fed_by)))  # type: ignore[misc]
@@ -145,9 +145,6 @@ def _component_problems(
     path: str, component: Component, duration: Fraction | None, epoch: str | None
 ) -> Iterator[TerrafixError]:
     missing = component.missing_settings()
-    given, kept = component.given_parameters, component.parameter_values
-    # and reported; None may be a value, too: of a file that is not named
-    refused = any(given[n] is None and (n not in kept or kept[n] is not None) for n in given)
     for name in missing:
         kind = component.settings()[name].kind()
         yield ConfigurationError(f"'{path}' needs a value for '{name}': it takes {kind}")
@@ -158,7 +155,7 @@ def _component_problems(
             f"'{path}' cannot step: {type(component).__name__} must provide _step_impl(t, dt)"
         )
     actions: list[Callable[[], None]] = []
-    if not missing and not refused:
+    if not missing and not _refused(component):
         actions.append(component.validate)
         actions.append(lambda: component.validate_epoch(epoch))
         if duration is not None:
@@ -170,6 +167,12 @@ def _component_problems(
             action()
         except TerrafixError as error:
             yield error
+
+
+def _refused(component: Component) -> bool:
+    """Whether a value was refused, which is reported; None may be one: of a file not named."""
+    given, kept = component.given_parameters, component.parameter_values
+    return any(given[n] is None and (n not in kept or kept[n] is not None) for n in given)
 
 
 def _feeding_components(flat: FlatSystem) -> FedBy:

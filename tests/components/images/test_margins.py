@@ -93,3 +93,22 @@ def test_a_reference_is_asked_to_reach_beyond_the_image():
     assert "misalignment" not in notes(("case", "TC-1"))
     text = problem(("reference.n_cells", "500"))
     assert "an image of 'former' has 600 cells, and 'reference' 500: none lies within" in text
+
+
+def test_where_a_value_was_refused_nothing_is_foreseen():
+    with pytest.raises(SystemCheckError, match=r"has 1 problem\n.*'echo.prf' is -2160.0 Hz"):
+        read_system(SYSTEM, [("echo.prf", "-2160 Hz")])
+
+
+@pytest.mark.parametrize("name", ["echo", "former", "correct"])
+def test_one_that_looks_to_the_other_side_is_named(name):
+    """Where angles below zero are taken; elsewhere they are refused for what they are."""
+    text = problem((f"{name}.look", "-34.3 deg"))
+    assert f"'{name}.look' is -" in text
+    assert "to the other side of the track" in text or "it must be positive" in text
+
+
+def test_a_filter_that_believes_in_another_angle_is_told():
+    said = "'correct.look' is 30 deg and 'former.look' 34.3 deg: nominally they are one antenna's"
+    assert said in notes(("correct.look", "30 deg"))
+    assert "one antenna's" not in notes()
