@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from terrafix.cosim.basics.arrays import FloatArray
@@ -80,6 +82,33 @@ def shared_setting(component: Component, name: str) -> FloatArray:
     if component.lent is None:
         return np.asarray(component.setting(name))
     return np.asarray(getattr(component, name)[0])
+
+
+_SAME_ANGLE = 1e-9
+
+
+def foreseen_side(component: Component, other: Component | None) -> Iterator[str]:
+    """Whether two that have the nominal angles of one antenna agree on them.
+
+    Raises
+    ------
+    ConfigurationError
+        If one looks to the right of the track, the other to the left.
+    """
+    for name in ("look", "squint"):
+        if other is None or not {name} <= set(component.settings()) & set(other.settings()):
+            continue
+        own, others = (float(c.setting(name)) for c in (component, other))
+        said = (
+            f"'{component.name}.{name}' is {np.degrees(own):.6g} deg and '{other.name}.{name}' "
+            f"{np.degrees(others):.6g} deg"
+        )
+        if name == "look" and own * others < 0:
+            raise ConfigurationError(
+                f"{said}: one looks to the other side of the track\n  set both to the same"
+            )
+        if abs(own - others) > _SAME_ANGLE:
+            yield f"{said}: nominally they are one antenna's"
 
 
 def require_earth(component: Component, earth: str, r_e: FloatArray) -> None:

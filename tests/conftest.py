@@ -1,5 +1,6 @@
-"""What all tests share: objects of FMUs that the compiler made once."""
+"""What all tests share: objects of FMUs that the compiler made once, and a quiet collector."""
 
+import gc
 import re
 import shutil
 import tempfile
@@ -9,6 +10,14 @@ from pathlib import Path
 import pytest
 
 from terrafix.cosim.exchange.fmi.write import binaries
+
+gc.disable()  # nothing of what collecting tests makes is garbage
+
+
+def pytest_collection_finish():
+    """Thousands of tests and their modules stay until the end: leave them to no collector."""
+    gc.freeze()
+    gc.enable()
 
 
 def read_by_the_compiler(folder: Path, name: str, seen: dict[str, str]) -> dict[str, str]:

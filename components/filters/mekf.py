@@ -8,11 +8,15 @@ the prior at the end of the step: no loop, no hidden delay.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from terrafix.components.fields import ENVIRONMENT, ESTIMATE, FIX, INNOVATION, KNOWN_STATE
 from terrafix.components.filters.family import check_start, transition_ports
+from terrafix.components.shared import foreseen_side
 from terrafix.cosim.basics.clock import Rate
+from terrafix.cosim.declare.component import FedBy
 from terrafix.cosim.declare.parameters import Choice, Count, Flag, OptionalFilePath, Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -148,6 +152,13 @@ class MekfCorrect(SymbolicComponent):
     estimate = BundleOutput(ESTIMATE, doc="the posterior where there is one, else the prior")
     posterior = MessageOutput(fields=ESTIMATE, doc="the estimate, only where it was corrected")
     innovation = MessageOutput(fields=INNOVATION, doc="what became of the fix")
+
+    def foreseen(self, fed_by: FedBy) -> Iterator[str]:
+        """Tell where what measures has other nominal angles."""
+        sensor = fed_by(self, "fix")
+        if sensor is not None and "image" in sensor.inputs():
+            sensor = fed_by(sensor, "image")  # which the matcher recognized
+        return foreseen_side(self, sensor)
 
     def build_model(self) -> Model:
         """Build the model for the chosen update and measurement."""

@@ -10,17 +10,19 @@ size are at fault, as they will be the next time.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from terrafix.components.fields import ACQUISITION, ECHO, ESTIMATE, IMAGE, RADAR
+from terrafix.components.images.margins import foreseen_image
 from terrafix.components.sensors.compiled import row_operations
 from terrafix.components.shared import require_common
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.component import Component, FedBy
 from terrafix.cosim.declare.parameters import Count, Flag, Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -121,6 +123,10 @@ class ImageFormer(Component):
     )
     image = MessageOutput(fields=IMAGE, doc="which image is a member's, and what it measures")
     reason = Output(doc="of the last echo: index into terrafix.models.radar.imaging.REASONS")
+
+    def foreseen(self, fed_by: FedBy) -> Iterator[str]:
+        """Tell what echo and autofocus have to spare for the image."""
+        return foreseen_image(self, fed_by)
 
     def initialize(self) -> None:
         """Look whether what forms images is common to all members."""

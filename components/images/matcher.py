@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from terrafix.components.fields import ESTIMATE, FIX, IMAGE
+from terrafix.components.images.margins import foreseen_match
 from terrafix.components.images.reference import OnReference
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
+from terrafix.cosim.declare.component import FedBy
 from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
@@ -63,6 +67,10 @@ class ImageMatcher(OnReference):
         (None, 4), doc="middles of the parts of the first image that agree, on it and the reference"
     )
     outline = SharedOutput((4, 2), doc="corners of the first image on it; NaN if not found")
+
+    def foreseen(self, fed_by: FedBy) -> Iterator[str]:
+        """Tell what the reference has to spare for the image."""
+        return foreseen_match(self, fed_by)
 
     def _step_impl(self, t: float, dt: float) -> None:
         fresh = self.image.fresh & self.environment.active

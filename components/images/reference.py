@@ -403,7 +403,10 @@ class ReferenceFile(ReferenceSource):
 
     def _read(self, path: Path) -> Reference:
         try:
-            return read_reference(path)
+            reference = read_reference(path)
+            if reference.amplitude.min() < 0:
+                raise ValueError(f"'{path}': an amplitude cannot be negative")
+            return reference
         except (OSError, ValueError) as error:
             raise ConfigurationError(
                 f"'{self.name}' cannot read its reference: {error}\n"

@@ -44,6 +44,10 @@ def _own(base: type) -> bool:
     )
 
 
+FedBy = Callable[["Component", str], "Component | None"]
+"""Tells which component drives an input of another."""
+
+
 class Owner(Protocol):
     """What has ports: a component, or a system that exposes some."""
 
@@ -386,6 +390,18 @@ class Component(Shown):
 
         An EpochError, where the epoch itself is missing or wrong, is told once for all components.
         """
+
+    def foreseen(self, fed_by: FedBy) -> Iterable[str]:
+        """Tell what may become narrow in a flight, by what feeds it, once all else is right.
+
+        ``fed_by(component, "port")`` is the component that drives an input, or None.
+
+        Raises
+        ------
+        ConfigurationError
+            If it cannot work.
+        """
+        return ()
 
     @classmethod
     def asks_for_epoch(cls) -> bool:

@@ -20,7 +20,7 @@ from terrafix.cosim.basics.errors import (
     WiringError,
 )
 from terrafix.cosim.basics.units import check_unit, conversion_factor
-from terrafix.cosim.declare.component import Component
+from terrafix.cosim.declare.component import Component, FedBy
 from terrafix.cosim.declare.ports import Port
 from terrafix.cosim.memory.fields import Field
 from terrafix.cosim.show.tables import Block, Shown
@@ -129,10 +129,15 @@ def check(system: Flattened, *, duration: Fraction | None = None, outside: bool 
         order.extend(stepping_order(flat))
 
     attempt(find_order)
+    foreseen: list[str] = []
+    if not problems and not any(map(_refused, flat.components.values())):
+        fed_by = _feeding_components(flat)
+        for path, component in flat.components.items():
+            attempt(lambda p=path, c=component: foreseen.extend(_foreseen(p, c, fed_by)))  # type: ignore[misc]
     if problems:
         raise SystemCheckError(system.name, _once(problems))
     start = starting_order(flat, order)
-    notes = [*system.notes, *_notes(flat), *_starting_notes(start)]
+    notes = [*system.notes, *_notes(flat), *_starting_notes(start), *foreseen]
     return Plan(flat, order, base, grid, notes, start, system.epoch)
 
 
@@ -140,9 +145,6 @@ def _component_problems(
     path: str, component: Component, duration: Fraction | None, epoch: str | None
 ) -> Iterator[TerrafixError]:
     missing = component.missing_settings()
-    given, kept = component.given_parameters, component.parameter_values
-    # and reported; None may be a value, too: of a file that is not named
-    refused = any(given[n] is None and (n not in kept or kept[n] is not None) for n in given)
     for name in missing:
         kind = component.settings()[name].kind()
         yield ConfigurationError(f"'{path}' needs a value for '{name}': it takes {kind}")
@@ -153,7 +155,7 @@ def _component_problems(
             f"'{path}' cannot step: {type(component).__name__} must provide _step_impl(t, dt)"
         )
     actions: list[Callable[[], None]] = []
-    if not missing and not refused:
+    if not missing and not _refused(component):
         actions.append(component.validate)
         actions.append(lambda: component.validate_epoch(epoch))
         if duration is not None:
@@ -165,6 +167,24 @@ def _component_problems(
             action()
         except TerrafixError as error:
             yield error
+
+
+def _refused(component: Component) -> bool:
+    """Whether a value was refused, which is reported; None may be one: of a file not named."""
+    given, kept = component.given_parameters, component.parameter_values
+    return any(given[n] is None and (n not in kept or kept[n] is not None) for n in given)
+
+
+def _feeding_components(flat: FlatSystem) -> FedBy:
+    """Which component drives an input of another."""
+    paths = {id(component): path for path, component in flat.components.items()}
+    sources = {c.target: flat.components[flat.owner(c.source)] for c in flat.connections}
+    return lambda component, port: sources.get(f"{paths[id(component)]}.{port}")
+
+
+def _foreseen(path: str, component: Component, fed_by: FedBy) -> Iterator[str]:
+    for note in component.foreseen(fed_by):
+        yield f"'{path}': {note}"
 
 
 def _once(problems: list[TerrafixError]) -> list[TerrafixError]:
