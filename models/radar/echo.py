@@ -47,7 +47,10 @@ from terrafix.models.radar.history import RangeHistories, range_derivatives
 from terrafix.models.radar.scene import Scene
 from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
-_TAPS = 12
+_TAPS, _WINDOW = 16, 5.0
+"""Of the interpolation of points and its window: it errs by 0.1 % over 0.4 cycles per pixel."""
+_SAME_BEAM = 1.0
+"""Change of Doppler over the chirp's band below which all of it is seen by one beam [Hz]."""
 
 
 @dataclass(frozen=True)
@@ -331,8 +334,8 @@ def add_points(
 
 
 def _interpolator(x: FloatArray) -> FloatArray:
-    window = np.i0(2.5 * np.sqrt(np.maximum(0.0, 1 - (2 * x / _TAPS) ** 2))) / np.i0(2.5)
-    return np.asarray(np.sinc(x) * window)
+    window = np.i0(_WINDOW * np.sqrt(np.maximum(0.0, 1 - (2 * x / _TAPS) ** 2)))
+    return np.asarray(np.sinc(x) * window / np.i0(_WINDOW))
 
 
 def received(
@@ -372,8 +375,8 @@ def received(
     total[~lit] = 0
     speed = float(np.linalg.norm(footprint.arc.velocity(footprint.middle[0])))
     rate = _doppler_rate(footprint)
-    beam = np.sinc(acquisition.antenna_length * (frequency - acquisition.centroid) / (2 * speed))
-    weight = beam**2 * radar.prf / np.sqrt(rate)
+    steepness, centroid = acquisition.antenna_length / (2 * speed), acquisition.centroid
+    weight = lit * np.float32(radar.prf / np.sqrt(rate))
     cells = np.arange(n_cells)
     ranges = np.asarray(footprint.near_range + cells * radar.range_spacing, np.float64)
     by_range = chebyshev.chebvander(_scaled_to(ranges, middle.span), 4).T
@@ -385,7 +388,7 @@ def received(
         for part, history in ((low, histories[0]), (high, histories[1])):
             operations.turn_by(part, scale * (history.at(x) @ by_range))
         low += high
-        low *= (weight[rows] * lit[rows]).astype(np.float32)[:, None]
+        low *= weight[rows, None]
         total[rows] = low
 
     over([rows for rows in batches(n_lines) if lit[rows].any()], compress_inversely)
@@ -395,6 +398,11 @@ def received(
     pulse = fft.fft(chirp_replica(radar), n_cells).astype(np.complex64) * unit_phasor(-0.125)
     f_r = fft.fftfreq(n_cells, 1 / radar.sample_rate)
 
+    # a direction is seen at Doppler frequencies in proportion to those of the pulse
+    share = radar.carrier / (radar.carrier + f_r)
+    if abs(centroid) * radar.bandwidth / radar.carrier < _SAME_BEAM:
+        share = np.ones(1)
+
     def send(rows: slice) -> None:
         f = np.where(lit[rows], frequency[rows], acquisition.centroid)[:, None]
         own = scale * middle.middle(radar.wavelength * f)
@@ -402,6 +410,7 @@ def received(
         cycles = cycles * middle.middle(SPEED_OF_LIGHT * f / (radar.carrier + f_r)) - own
         operations.turn_by(total[rows], cycles)
         total[rows] *= pulse
+        total[rows] *= np.sinc(steepness * (f * share - centroid)).astype(np.float32) ** 2
 
     over([rows for rows in batches(n_lines) if lit[rows].any()], send)
     total = fft.ifft(total, axis=1, overwrite_x=True, workers=-1)

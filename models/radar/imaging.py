@@ -141,7 +141,8 @@ class Imager:
         key = processing, velocity
         if key not in self._images:
             domain = self.curve(processing).domain
-            self._images[key] = azimuth_compressed(domain, velocity, band=self._band(domain))
+            band = self._band(domain)
+            self._images[key] = azimuth_compressed(domain, velocity, band=band, deskewed=True)
         return self._images[key]
 
     def _band(self, domain: RangeDoppler) -> tuple[float, float]:
