@@ -23,7 +23,6 @@ from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT, Radar, chirp_replica, unit_phasor
 from terrafix.models.radar.echo import Acquisition, add_points, illuminated_footprint, received
 from terrafix.models.radar.focusing import Image, azimuth_compressed, range_doppler
-from terrafix.models.radar.footprint import Footprint
 
 RADARSAT = Radar(5.3e9, 1256.98, 32.317e6, -0.72135e12, 41.75e-6, 0.75 * 1256.98)
 PALSAR = Radar(1269.768992e6, 2160.0, 16e6, -14e6 / 27e-6, 27e-6, 1513.0)
@@ -185,5 +184,5 @@ if __name__ == "__main__":
     started = time.process_time()
     echo()
     processor("RADARSAT-1", RADARSAT, (1536, 3400), targets)
-    processor("PALSAR", PALSAR, (7452, 1100), targets)
+    processor("PALSAR", PALSAR, (8700, 1100), targets)
     print(f"{time.process_time() - started:.0f} s of processor")
