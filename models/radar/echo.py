@@ -279,14 +279,10 @@ def _bright_points(
     """Add the scene's bright points between the pixels."""
     latitude, longitude, amplitude, phase = scene.points(*terrain.cells)
     height = scene.dem.at(latitude, longitude)
-    add_points(
-        layers,
-        terrain.footprint,
-        terrain.footprint.ground.point(latitude, longitude, height),
-        height,
-        amplitude * np.exp(2j * np.pi * phase),
-        heights,
-    )
+    p = terrain.footprint.ground.point(latitude, longitude, height)
+    lit = terrain.visible(p)
+    reflection = amplitude * np.exp(2j * np.pi * phase)
+    add_points(layers, terrain.footprint, p[lit], height[lit], reflection[lit], heights)
 
 
 def add_points(
