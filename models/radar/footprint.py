@@ -14,11 +14,12 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray, Single
+from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.ground import EllipsoidGround, Ground
 from terrafix.models.motion.arc import seen_at
 from terrafix.models.motion.sampled import Arc
 from terrafix.models.radar.chirp import Radar
-from terrafix.models.radar.relief import crossings, is_folded, seen
+from terrafix.models.radar.relief import crossings, folded_share, seen
 from terrafix.models.radar.scene import Scene, brightness
 
 _COARSE = (16, 4)
@@ -37,6 +38,8 @@ _EARTH = EllipsoidGround()
 _STEEP = 0.25
 """Sine of the angle between view and slope, or cosine of that of incidence, below which lines are
 looked at: slopes between points of an elevation model are up to twice those over two steps."""
+_FEW = 1e-4
+"""Share of the samples of terrain that are folded or hidden, below which they do not show."""
 _PLACES = 4
 """Places that share a cell, at most: those farther out are left out."""
 _ROUNDS = 40
@@ -246,9 +249,17 @@ class _Relief:
     ) -> None:
         self.footprint, self.scene, self.t = footprint, scene, t
         self.level = float(np.median(height))
+        latitude = float(
+            footprint.ground.geodetic(footprint.points(t[0], ranges[0], self.level))[0]
+        )
         spacing = footprint.radar.range_spacing
         margin = 1.5 * float(np.ptp(height)) + 4 * spacing
-        self.x = np.arange(ranges[0] - margin, ranges[-1] + margin, spacing)
+        # three samples of a step of the elevation model, on ground that is seen at 40 deg
+        step = min(scene.dem.latitude_step, scene.dem.longitude_step * np.cos(latitude))
+        fine = EARTH.radius * step / 3 * 0.64 / spacing
+        self.x = np.arange(
+            ranges[0] - margin, ranges[-1] + margin, spacing * np.clip(round(fine), 1, 4)
+        )
         nodes = [_nodes(a, 7) for a in (t[[0, -1]], self.x[[0, -1]])]
         p = footprint.points(nodes[0][:, None], nodes[1], np.array(self.level))
         self.latitude, self.longitude = self._places(nodes, p)
@@ -259,7 +270,7 @@ class _Relief:
         self.slant_range = np.linalg.norm(line, axis=-1)
         down = footprint.ground.axes(footprint.arc.position(t))[:, 2]
         self.angle = np.arccos(np.einsum("mnk,mk->mn", line, down) / self.slant_range)
-        self.folded = bool(is_folded(self.slant_range, self.angle).any())
+        self.folded = folded_share(self.slant_range, self.angle) > _FEW
 
     def _places(self, nodes: list[FloatArray], p: FloatArray) -> list[FloatArray]:
         """Latitude and longitude [rad] of all samples, by polynomials through some."""

@@ -39,11 +39,10 @@ def seen(angle: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(angle >= np.maximum.accumulate(angle, axis=-1))
 
 
-def is_folded(slant_range: FloatArray, angle: FloatArray) -> NDArray[np.bool_]:
-    """Whether lines (..., n) have layover or shadow anywhere."""
-    return np.asarray(
-        (np.diff(slant_range) <= 0).any(axis=-1) | (np.diff(angle) < 0).any(axis=-1)
-    )
+def folded_share(slant_range: FloatArray, angle: FloatArray) -> float:
+    """Share of the samples of lines (..., n) that are nearer than those before them, or hidden."""
+    falling = np.diff(slant_range) <= 0
+    return float(np.mean(falling | ~seen(angle)[..., 1:]))
 
 
 def crossings(cells: FloatArray, visible: NDArray[np.bool_]) -> Crossings:

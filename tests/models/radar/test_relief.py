@@ -8,7 +8,7 @@ from terrafix.models.maps.dem import Dem
 from terrafix.models.motion.sampled import SampledArc
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.footprint import Footprint, TerrainGrid
-from terrafix.models.radar.relief import crossings, is_folded, seen
+from terrafix.models.radar.relief import crossings, folded_share, seen
 from terrafix.models.radar.scene import Scene, brightness
 
 RADAR = Radar(1.27e9, 2000.0, 100e6, 90e6 / 1e-6, 1e-6, 100.0)  # cells of 1.5 m
@@ -49,12 +49,12 @@ def test_a_steep_ridge_is_laid_over_and_casts_a_shadow(side):
     cell = RADAR.range_spacing
     plain = brightness(UP / R)
     slope = np.arctan2(height, half)
-    before, dark, after = R < crest - 2 * cell, (R > foot + cell) & (R < end - cell), R > end + cell
+    before, dark, after = crest - 2 * cell > R, (foot + cell < R) & (end - cell > R), end + cell < R
     np.testing.assert_allclose(power[before], plain[before], rtol=0.01)
     assert (power[dark] < 1e-5).all()
     np.testing.assert_allclose(power[after], plain[after], rtol=0.01)
     # layover: the plain before the foot, and the slope, seen from its other side
-    both = (R > crest + 8 * cell) & (R < foot - 8 * cell)
+    both = (crest + 8 * cell < R) & (foot - 8 * cell > R)
     s = np.linspace(1.0, 0.0, 1000)
     y, z = FAR - half * (1 - s), height * s
     angle = np.interp(R[both], np.hypot(UP - z, y), np.arctan2(y, UP - z)) - slope
@@ -88,4 +88,7 @@ def test_crossings_of_a_folded_line_come_in_its_order():
 def test_what_lies_below_a_ray_is_hidden():
     angle = np.array([[0.1, 0.3, 0.2, 0.25, 0.4], [0.1, 0.2, 0.3, 0.4, 0.5]])
     assert seen(angle)[0].tolist() == [True, True, False, False, True]
-    assert is_folded(np.tile(np.arange(5.0), (2, 1)), angle).tolist() == [True, False]
+    outward = np.tile(np.arange(5.0), (2, 1))
+    assert folded_share(outward, angle) == 2 / 8
+    outward[1, 2] = 0.5
+    assert folded_share(outward, angle) == 3 / 8
