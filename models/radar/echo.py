@@ -397,7 +397,7 @@ def received(
 
     # the Doppler rate is in proportion to the frequency
     pulse *= np.sqrt(radar.carrier / (radar.carrier + f_r)).astype(np.float32)
-    # a direction is seen at Doppler frequencies in proportion to those of the pulse: to second order
+    # and so is the Doppler frequency at which a direction is seen: to second order
     offset = frequency - centroid
     low, own, high = (np.sinc(steepness * (offset + h)) ** 2 for h in (-1.0, 0.0, 1.0))
     curve = [own, (high - low) / 2 * frequency, (high - 2 * own + low) / 2 * frequency**2]

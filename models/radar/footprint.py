@@ -1,9 +1,9 @@
 """What a side-looking radar sees: a grid of time and range, and the terrain under it.
 
 Grids are of the time and the slant range at which the beam's center passes a place (broadside for
-an unsquinted beam). Terrain is looked up at every few lines and cells and interpolated between. Where slopes are so steep
-that cells show several places, or places are hidden, it is looked up along lines outward instead
-(`terrafix.models.radar.relief`).
+an unsquinted beam). Terrain is looked up at every few lines and cells and interpolated between.
+Where slopes are so steep that cells show several places, or places are hidden, it is looked up
+along lines outward instead (`terrafix.models.radar.relief`).
 """
 
 from __future__ import annotations
@@ -281,7 +281,7 @@ class _Relief:
         found = []
         for values in (latitude, longitude):
             c = _chebyshev3(values[..., None])[..., 0]
-            found.append(np.asarray(chebyshev.chebgrid2d(*x, c)))
+            found.append(np.asarray(chebyshev.chebgrid2d(x[0], x[1], c)))
         return found
 
     def cells(self, cell: float, least: tuple[range, ...]) -> tuple[range, ...]:

@@ -3,7 +3,8 @@ r"""Layover and shadow: what a line of terrain that a beam passes together shows
 Along such a line, from below the radar outward, terrain at distance :math:`x` is seen at the range
 :math:`R(x)` and the angle off nadir :math:`\eta(x)`. Where slopes that face the radar are steeper
 than its view :math:`R` falls: a range is then reached several times, and a cell shows the sum of
-all that share it (layover). What lies at a smaller angle than something before it is hidden (shadow).
+all that share it (layover). What lies at a smaller angle than something before it is hidden
+(shadow).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Crossings:
 
 
 def seen(angle: FloatArray) -> NDArray[np.bool_]:
-    """Whether samples of lines (..., n) are seen past all before them, by their angles off nadir."""
+    """Whether samples of lines (..., n) are seen past all before them, by angles off nadir."""
     return np.asarray(angle >= np.maximum.accumulate(angle, axis=-1))
 
 
