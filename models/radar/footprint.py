@@ -281,7 +281,7 @@ class _Relief:
         found = []
         for values in (latitude, longitude):
             c = _chebyshev3(values[..., None])[..., 0]
-            found.append(np.asarray(chebyshev.chebgrid2d(x[0], x[1], c)))
+            found.append(np.asarray(chebyshev.chebgrid2d(x[0], x[1], c), np.float64))
         return found
 
     def cells(self, cell: float, least: tuple[range, ...]) -> tuple[range, ...]:
