@@ -55,7 +55,8 @@ from terrafix.models.radar.speckle import (
 )
 from terrafix.models.radar.spectra import ARRAY_ROWS, Rows
 
-_TAPS = 12
+_TAPS, _WINDOW = 20, 5.5
+"""Of the interpolation of points and its window: it errs by 0.06 % over 0.4 cycles per pixel."""
 _COLUMNS = 64
 """Columns whose scatterers are made, and transformed to Doppler, at a time."""
 _ALIKE = 0.05
@@ -245,8 +246,11 @@ def illuminated_footprint(arc: Arc, acquisition: Acquisition) -> tuple[Footprint
     aperture = acquisition.illuminated / _doppler_rate(at)
     before = int(np.ceil(aperture / 2 * radar.prf)) + 16
     n_lines = int(fft.next_fast_len(acquisition.n_lines + 2 * before))
-    shift = acquisition.near_range - (radar.n_pulse + 16) * radar.range_spacing
-    n_cells = int(fft.next_fast_len(acquisition.n_cells + radar.n_pulse + 32))
+    # a squinted beam sees a range grow or shrink all the time
+    walk = radar.wavelength * abs(acquisition.centroid) / 2 * aperture / 2
+    margin = 16 + int(np.ceil(walk / radar.range_spacing))
+    shift = acquisition.near_range - (radar.n_pulse + margin) * radar.range_spacing
+    n_cells = int(fft.next_fast_len(acquisition.n_cells + radar.n_pulse + 2 * margin))
     first = acquisition.first_time - before / radar.prf
     centroid, side = acquisition.centroid, acquisition.side
     whole = Footprint(arc, radar, first, n_lines, shift, n_cells, centroid, side=side)
@@ -267,8 +271,9 @@ def _bright_points(terrain: TerrainGrid, scene: Scene, heights: tuple[float, flo
     latitude, longitude, amplitude, phase = scene.points(*terrain.cells)
     height = scene.dem.at(latitude, longitude)
     p = terrain.footprint.ground.point(latitude, longitude, height)
+    lit = terrain.visible(p)
     reflection = amplitude * np.exp(2j * np.pi * phase)
-    return _Points(terrain.footprint, p, height, reflection, heights)
+    return _Points(terrain.footprint, p[lit], height[lit], reflection[lit], heights)
 
 
 def add_points(
@@ -340,8 +345,8 @@ class _Points:
 
 
 def _interpolator(x: FloatArray) -> FloatArray:
-    window = np.i0(2.5 * np.sqrt(np.maximum(0.0, 1 - (2 * x / _TAPS) ** 2))) / np.i0(2.5)
-    return np.asarray(np.sinc(x) * window)
+    window = np.i0(_WINDOW * np.sqrt(np.maximum(0.0, 1 - (2 * x / _TAPS) ** 2)))
+    return np.asarray(np.sinc(x) * window / np.i0(_WINDOW))
 
 
 def received(
@@ -394,8 +399,8 @@ def _received(
     middle = histories[0]
     speed = float(np.linalg.norm(footprint.arc.velocity(footprint.middle[0])))
     rate = _doppler_rate(footprint)
-    beam = np.sinc(acquisition.antenna_length * (frequency - acquisition.centroid) / (2 * speed))
-    weight = (lit * beam**2 * radar.prf / np.sqrt(rate)).astype(np.float32)
+    steepness, centroid = acquisition.antenna_length / (2 * speed), acquisition.centroid
+    weight = lit * np.float32(radar.prf / np.sqrt(rate))
     cells = np.arange(n_cells)
     ranges = np.asarray(footprint.near_range + cells * radar.range_spacing, np.float64)
     by_range = chebyshev.chebvander(_scaled_to(ranges, middle.span), 4).T
@@ -424,6 +429,17 @@ def _received(
     nodes = radar.sample_rate / 2 * chebyshev.chebpts1(_SENT + 1)
     to_coefficients = np.linalg.inv(chebyshev.chebvander(chebyshev.chebpts1(_SENT + 1), _SENT)).T
 
+    f_r = fft.fftfreq(n_cells, 1 / radar.sample_rate)
+    # the Doppler rate is in proportion to the frequency
+    pulse *= np.sqrt(radar.carrier / (radar.carrier + f_r)).astype(np.float32)
+    # and so is the Doppler frequency at which a direction is seen: to second order
+    offset = frequency - centroid
+    low, own, high = (np.sinc(steepness * (offset + h)) ** 2 for h in (-1.0, 0.0, 1.0))
+    curve = [own, (high - low) / 2 * frequency, (high - 2 * own + low) / 2 * frequency**2]
+    beam = np.stack(curve, axis=1).astype(np.float32)
+    share = np.power.outer(radar.carrier / (radar.carrier + f_r) - 1, np.arange(3)).T
+    share = np.ascontiguousarray(share, np.float32)
+
     def send(spectrum: ComplexArray, rows: slice) -> None:
         f = np.where(lit[rows], frequency[rows], acquisition.centroid)[:, None]
         carrier = radar.carrier + nodes
@@ -431,6 +447,8 @@ def _received(
         cycles -= scale * middle.middle(radar.wavelength * f)
         operations.turn_by(spectrum, cycles @ to_coefficients @ by_cell)
         spectrum *= pulse
+        spectrum *= beam[rows] @ share
+
 
     def receive(rows: slice) -> None:
         # ranges other than the middle one move by what their migration differs from its

@@ -20,7 +20,8 @@ with the velocity that the navigator believes; azimuth compression is done for a
 afterwards.
 
 Frequencies :math:`f` are absolute, about the Doppler centroid, so that squint is no special case.
-Lines of an image are at times of zero Doppler, columns at closest ranges.
+Lines of an image are at times of zero Doppler, columns at closest ranges; lines of one that is
+deskewed at times at which the beam's center passes.
 
 References
 ----------
@@ -139,7 +140,8 @@ class Image:
     data : ndarray of complex64, shape (n_lines, n_cells)
         Amplitudes; the phase of a point is that of its closest range.
     t : ndarray, shape (n_lines,)
-        Time of zero Doppler of each line [s], on the clock of the echo.
+        Time of each line [s], on the clock of the echo: when what it shows was seen with the
+        Doppler frequency `dated`.
     slant_range : ndarray, shape (n_cells,)
         Closest range of each column [m].
     rows, columns : slice
@@ -154,6 +156,8 @@ class Image:
     radar : Radar
     velocity_slope : float
         How much it grows with range [m/s per m].
+    dated : float
+        Doppler frequency of the times of the lines [Hz]; zero if they are those of closest range.
     """
 
     data: ComplexArray
@@ -166,6 +170,7 @@ class Image:
     velocity: float
     radar: Radar
     velocity_slope: float = 0.0
+    dated: float = 0.0
 
     @property
     def doppler(self) -> float:
@@ -204,8 +209,9 @@ class Image:
         return float(migration_factor(np.array(doppler), self.velocity, self.radar.wavelength))
 
     def _lag(self, closest: FloatArray, doppler: float) -> FloatArray:
-        """Seconds from zero Doppler to another Doppler frequency."""
-        lag = _lag(np.array(doppler), self.velocity, self.radar)
+        """Seconds from when lines are dated to another Doppler frequency."""
+        seen, dated = _lag(np.array([doppler, self.dated]), self.velocity, self.radar)
+        lag = seen - dated
         center = float(self.slant_range[self.columns].mean())
         return np.asarray(lag * _leverage(closest, center, self.velocity, self.velocity_slope))
 
@@ -335,6 +341,7 @@ def azimuth_compressed(
     *,
     window: Window = "boxcar",
     band: tuple[float, float] | None = None,
+    deskewed: bool = False,
 ) -> Image:
     """Compress in azimuth with a given effective velocity.
 
@@ -348,6 +355,9 @@ def azimuth_compressed(
     band : tuple of float, optional
         Lowest and highest absolute Doppler frequency to be used [Hz]: a part of it is an azimuth
         look. The whole processed band by default.
+    deskewed : bool
+        Whether lines are those of one time at which the beam's center passes, and not of one time
+        of zero Doppler: what a squinted beam sees together is then together.
 
     Raises
     ------
@@ -357,7 +367,8 @@ def azimuth_compressed(
     """
     half = domain.radar.doppler_bandwidth / 2
     whole = (domain.centroid - half, domain.centroid + half)
-    return _compressed(domain, velocity, whole if band is None else band, band or whole, window)
+    own = whole if band is None else band
+    return _compressed(domain, velocity, own, band or whole, window, deskewed=deskewed)
 
 
 def _compressed(
@@ -366,6 +377,8 @@ def _compressed(
     band: tuple[float, float],
     frame: tuple[float, float],
     window: Window,
+    *,
+    deskewed: bool = False,
 ) -> Image:
     """Compress a band on the grid, and with the valid lines, of the band `frame` that holds it."""
     radar, frequency = domain.radar, domain.frequency
@@ -376,9 +389,12 @@ def _compressed(
     middle = float(np.clip(domain.centroid, *frame))
     leverage = _leverage(slant_range, center, velocity, domain.velocity_slope)
     edges = slant_range[domain.columns][[0, -1]]
-    first, last = _focused_times(domain, np.outer(_lag(np.array(frame), velocity, radar), edges))
+    lag = float(_lag(np.array(middle), velocity, radar))
+    dated, behind = (middle, lag) if deskewed else (0.0, 0.0)
+    lags = np.outer(_lag(np.array(frame), velocity, radar) - behind, edges)
+    first, last = _focused_times(domain, lags)
     # rows follow the scene: a point stays at its place in the grid whatever the velocity
-    shift = -center * float(_lag(np.array(middle), velocity, radar))
+    shift = center * (behind - lag)
     # in an aperture shorter than the beam much lies before its first line
     before = domain.first_time + shift - first
     shift -= max(0, int(np.ceil(before * radar.prf))) / radar.prf
@@ -386,7 +402,7 @@ def _compressed(
     weights = get_window(window, len(rows), fftbins=False).astype(np.float32)
     data = np.zeros_like(domain.spectrum)
 
-    steep, constant = (2 / radar.wavelength) * (d - 1), f * shift
+    steep, constant = (2 / radar.wavelength) * (d - 1) - f * behind, f * shift
 
     def compress(batch: slice) -> None:
         part = domain.spectrum[rows[batch]]
@@ -414,11 +430,12 @@ def _compressed(
         velocity,
         radar,
         domain.velocity_slope,
+        dated,
     )
 
 
 def _focused_times(domain: RangeDoppler, lags: FloatArray) -> tuple[float, float]:
-    """First and last time [s] of zero Doppler of what is focused from all that can be had of it.
+    """First and last time [s] of lines that are focused from all that can be had of them.
 
     That is the whole band where lines are received for longer than the beam passes, and all lines
     where the beam sees for longer than they are received (an aperture shorter than the beam).
@@ -427,7 +444,7 @@ def _focused_times(domain: RangeDoppler, lags: FloatArray) -> tuple[float, float
     ----------
     domain : RangeDoppler
     lags : ndarray, shape (2, n)
-        From zero Doppler to the lower and the upper edge of the band, at some ranges [s].
+        From when lines are dated to the lower and the upper edge of the band, at some ranges [s].
     """
     start = domain.first_time
     stop = start + domain.duration

@@ -208,8 +208,9 @@ class Imager:
         key = processing, tenth
         if key not in self._images:
             domain = self.curve(processing).domain
+            band = self._band(domain)
             self._images[key] = azimuth_compressed(
-                domain, tenth * self.step / 10, band=self._band(domain)
+                domain, tenth * self.step / 10, band=band, deskewed=True
             )
         return self._images[key]
 
@@ -237,7 +238,7 @@ class Imager:
         spacing = image.slant_range[1] - image.slant_range[0]
         middle = image.slant_range[image.columns].mean()
         beyond = image.slant_range[0] + spacing * column - middle
-        late = image.t[0] + row / self.radar.prf - self.curve(processing).middle
+        late = float(image.seen_at(row, column, 0.0)[0]) - self.curve(processing).middle
         return float(velocity + processing.velocity_slope * beyond + velocity_rate * late)
 
     def _band(self, domain: RangeDoppler) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from terrafix.models.core.arrays import ComplexArray, FloatArray, Single
 from terrafix.models.geometry.ground import Ground
 from terrafix.models.radar.aperture import CUT, MARGIN, Aperture
 from terrafix.models.radar.chirp import unit_phasor
+from terrafix.models.radar.relief import seen
 from terrafix.models.radar.scene import Scene, brightness
 
 _SURFACE = 1.0
@@ -141,6 +142,9 @@ class LitGround:
         db = 10 * np.log10(np.maximum(brightness(cosine), 1e-6))
         # a cell of the slant plane holds more of level ground the steeper it is seen
         db += 5 * np.log10(np.maximum(1 - cosine**2, 1e-6))
+        above = float((self.center - self.base) @ self.up)
+        self._seen = seen(np.arctan2(y, above - rise))
+        db[~self._seen] = -60.0
         i, j = latitude / self.scene.cell, longitude / self.scene.cell
         rows, columns = (
             range(int(np.floor(a.min())) - 1, int(np.ceil(a.max())) + 2) for a in (i, j)
@@ -216,7 +220,13 @@ class LitGround:
         latitude, longitude, amplitude, phase = self.scene.points(*self.cells)
         height = self.scene.dem.at(latitude, longitude)
         p = self.ground.point(latitude, longitude, height)
-        return scatterers_at(p, amplitude * np.exp(2j * np.pi * phase))
+        way = (p - self.base) @ np.stack([self.ahead, self.out], axis=1)
+        i, j = (
+            np.clip(np.rint((a - span[0]) / _SURFACE).astype(np.intp), 0, n - 1)
+            for a, span, n in zip(way.T, (self.along, self.across), self._seen.shape, strict=True)
+        )
+        lit = self._seen[i, j]
+        return scatterers_at(p[lit], (amplitude * np.exp(2j * np.pi * phase))[lit])
 
 
 def _at(values: Single, i: Single, j: Single) -> Single:

@@ -144,6 +144,9 @@ class CompiledSpeckle:
         high: ComplexArray | None,
     ) -> None:
         """Write the scatterers of a part of the grid, in two layers."""
+        if terrain.folded:
+            ARRAY_SPECKLE.scatter(terrain, first, bits, heights, low, high)
+            return
         n_lines, n_cells = bits.shape
         _require_whole(bits, low, *([] if high is None else [high]))
         coarse, texture = terrain.coarse, terrain.texture

@@ -232,11 +232,10 @@ def test_lines_shorter_than_a_pulse_are_refused():
     assert "too few are left" in failure(lambda: small(("echo.n_cells", "180")))
 
 
-@pytest.mark.parametrize("owner", ["echo", "reference", "former"])
-def test_a_look_to_the_left_is_refused(owner):
-    text = failure(lambda: small((f"{owner}.look", "-34.3 deg")))
-    assert f"'{owner}.look' is -0.598" in text
-    assert "it must be positive" in text
+def test_a_look_to_the_left_in_a_right_looking_chain_is_refused():
+    text = failure(lambda: small(("former.look", "-34.3 deg")))
+    assert "'former' looks to the left of the track, but its echo came from the right" in text
+    assert "set former.look to that of what received the echo" in text
 
 
 def test_an_impossible_radar_is_refused():

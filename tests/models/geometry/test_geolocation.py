@@ -162,11 +162,3 @@ def test_a_boresight_into_space_or_beyond_the_map_is_refused(start_e):
     small = Dem(np.zeros((3, 3), np.float32), 0.0, 0.0, 1e-4, 1e-4, "a small map")
     with pytest.raises(ValueError, match=r"a small map does not cover latitude 29\.76"):
         boresight_on_terrain(r, v, q, ALIGNED, LOOK, 0.0, small)
-
-
-def test_a_boresight_to_the_left_is_refused(start_e):
-    """`ground_point` finds the place on the right: a left look would image the wrong side."""
-    r, v, q = start_e
-    for look, squint in ((-LOOK, 0.0), (-LOOK, 0.1), (-0.01, 0.1)):
-        with pytest.raises(ValueError, match="it looks to the left of the track"):
-            boresight_on_terrain(r, v, q, ALIGNED, look, squint, flat_dem())

@@ -71,6 +71,23 @@ def test_a_scene_is_lit_to_the_left_as_to_the_right(aircraft):
     assert (sides[0].out + sides[1].out) == pytest.approx(0.0)
 
 
+def test_a_wall_along_the_track_casts_a_shadow(aircraft):
+    """100 m high and 1200 m away, seen from 1000 m: to 1200 * 1000 / 900 m nothing is lit."""
+    t, r, axis = aircraft.track()
+    hills, middle = aircraft.HILLS, r.mean(axis=0)
+    place = aircraft.GROUND.geodetic(middle + np.array([0.0, 1200.0, 0.0]))
+    j = hills.longitude0 + hills.longitude_step * np.arange(hills.height.shape[1])
+    wall = np.where(np.abs(j - place[1]) < 0.6 * hills.longitude_step, 100.0, 0.0)
+    dem = replace(hills, height=np.tile(wall.astype(np.float32), (len(hills.height), 1)))
+    scene = replace(aircraft.FIELD, dem=dem)
+    lit = LitGround(scene, aircraft.GROUND, aircraft.aperture(t, r, axis))
+    row = lit._surface[1][lit._surface[1].shape[0] // 2]
+    dark = lit.across[0] + np.flatnonzero(row < -50)
+    assert dark.max() == pytest.approx(1200.0 / 0.9, abs=8.0)
+    assert dark.min() == pytest.approx(1205.0, abs=8.0)
+    assert len(dark) > 0.9 * np.ptp(dark)
+
+
 def test_what_cannot_be_received_is_refused(aircraft):
     t, r, axis = aircraft.track()
     own = aircraft.aperture(t, r, axis)

@@ -104,6 +104,31 @@ def test_a_pixel_and_when_it_was_seen_are_inverse(points, squinted):
     assert column == pytest.approx([30.0, 555.5], abs=1e-6)
 
 
+def test_lines_of_a_deskewed_image_are_what_the_beam_passes_together(points, squinted):
+    """Whatever its range, in the line of the time at which it was seen; skewed, 300 lines apart."""
+    echo, centroid, closest, passed = squinted
+    domain = range_doppler(echo, points.RADARSAT, near_range=NEAR, centroid=centroid, velocity=V)
+    straight = azimuth_compressed(domain, V, deskewed=True)
+    skewed = azimuth_compressed(domain, V)
+    t, R = straight.seen_at(400.0, np.array([50.0, 700.0]), centroid)
+    assert np.ptp(t) == pytest.approx(0.0, abs=1e-12)
+    rows, _ = skewed.pixel(t, R, centroid)
+    sine = centroid * points.RADARSAT.wavelength / (2 * V)
+    lag = sine / np.sqrt(1 - sine**2) / V * np.diff(straight.slant_range[[50, 700]])[0]
+    assert np.diff(rows)[0] == pytest.approx(lag * points.RADARSAT.prf, rel=1e-6)
+    # and no line is lost to the lag
+    assert straight.rows.stop - straight.rows.start > skewed.rows.stop - skewed.rows.start
+    sine = centroid * points.RADARSAT.wavelength / (2 * V)
+    seen = passed - closest * sine / np.sqrt(1 - sine**2) / V
+    for at, R in zip(seen, closest / np.sqrt(1 - sine**2), strict=True):
+        row, column = straight.pixel(at, R, centroid)
+        assert row == pytest.approx((at - straight.t[0]) * points.RADARSAT.prf, abs=1e-6)
+        i, j = round(float(row)), round(float(column))
+        part = np.abs(straight.data[i - 8 : i + 9, j - 8 : j + 9])
+        found = np.array(np.unravel_index(part.argmax(), part.shape)) - 8
+        assert found == pytest.approx([row - i, column - j], abs=0.7)
+
+
 def test_when_a_point_is_seen_does_not_depend_on_the_velocity_of_compression(points, squinted):
     """What an image measures is the passage of the beam, whatever blur there is."""
     echo, centroid, closest, passed = squinted
