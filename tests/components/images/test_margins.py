@@ -63,7 +63,7 @@ def test_with_the_lines_that_it_asks_for_nothing_is_narrow():
 
 def test_an_echo_without_room_for_the_image_is_refused():
     text = problem(("echo.n_lines", "6300"))
-    assert "wants an image of 960 lines by 600 cells, and of 6300 by 1072 in 'echo' 0 by" in text
+    assert "wants an image of 960 lines by 600 cells, and of 6300 by 1072 in 'echo' 1" in text
     least = re.search(r"set echo.n_lines to (\d+) at least", text)[1]
     assert "'echo' has 0 lines" in notes(("echo.n_lines", least))
     text = problem(("former.columns", "640"))
