@@ -23,7 +23,7 @@ test: $(STAMP)
 	@$(MAKE) --no-print-directory -j 2 tests lint types
 
 tests: $(STAMP)
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 ## tests alone
 quick: $(STAMP)

@@ -31,6 +31,7 @@ from terrafix.models.radar.margins import (
     PEAK_OF_IMAGING,
     aperture_lines,
     focused_size,
+    lines_needed,
     sigma_of,
 )
 from terrafix.models.sensors.effective_velocity import effective_velocity_array
@@ -134,9 +135,13 @@ def foreseen_image(former: Component, fed_by: FedBy) -> Iterator[str]:
     distance = view.beam.slant_range
     focused = focused_size(radar, lines, cells, distance, view.velocity)
     spare = focused[0] - wanted[0], focused[1] - wanted[1]
+    needed = (
+        lines_needed(radar, wanted[0], cells, distance, view.velocity),
+        cells - spare[1],
+    )
     for n, name, size, other in (
-        (spare[0], "n_lines", lines, "rows"),
-        (spare[1], "n_cells", cells, "columns"),
+        (spare[0], "n_lines", needed[0], "rows"),
+        (spare[1], "n_cells", needed[1], "columns"),
     ):
         if n < 0:
             raise ConfigurationError(
@@ -144,7 +149,7 @@ def foreseen_image(former: Component, fed_by: FedBy) -> Iterator[str]:
                 f"{lines} by {cells} in '{echo.name}' {max(focused[0], 0.0):.0f} by "
                 f"{max(focused[1], 0.0):.0f} are focused: the aperture is "
                 f"{aperture_lines(radar, distance, view.velocity):.0f} lines, a pulse "
-                f"{radar.n_pulse} cells\n  set {echo.name}.{name} to {int(np.ceil(size - n))} at "
+                f"{radar.n_pulse} cells\n  set {echo.name}.{name} to {int(np.ceil(size))} at "
                 f"least, or {former.name}.{other} to less"
             )
     raw = 8.0 * lines * cells
@@ -155,7 +160,8 @@ def foreseen_image(former: Component, fed_by: FedBy) -> Iterator[str]:
         f"set {echo.name}.n_lines or {echo.name}.n_cells to less",
     )
     off = SIGMAS * view.velocity_sigma
-    lost = focused[0] - focused_size(radar, lines, cells, distance, view.velocity - off)[0]
+    slower = view.velocity - off
+    lost = focused[0] - focused_size(radar, lines, cells, distance, slower)[0]
     yield (
         f"'{echo.name}' has {spare[0]:.0f} lines and {spare[1]:.0f} cells to spare for the image "
         f"and its aperture; it takes {raw / _MIB:.0f} MiB, and forming images "
@@ -166,7 +172,7 @@ def foreseen_image(former: Component, fed_by: FedBy) -> Iterator[str]:
             f"{SIGMAS:g} sigma of the estimate, {off:.0f} m/s of effective velocity, make the "
             f"aperture {lost:.0f} lines longer, and {spare[0]:.0f} are to spare: members that are "
             f"so far off have no image where autofocus finds no velocity; set {echo.name}.n_lines "
-            f"to {int(np.ceil(lines + lost - spare[0]))}"
+            f"to {int(np.ceil(lines_needed(radar, wanted[0], cells, distance, slower)))}"
         )
     yield from _narrow_autofocus(view)
 

@@ -397,7 +397,9 @@ def read_jacksboro() -> Dem:
     """
     from matplotlib import cbook
 
-    arrays: Any = cbook.get_sample_data("jacksboro_fault_dem.npz")
+    opened: Any = cbook.get_sample_data("jacksboro_fault_dem.npz")
+    with opened:
+        arrays = dict(opened)
     height = np.ascontiguousarray(arrays["elevation"][::-1], dtype=np.float32)
     d_lat, d_lon = float(arrays["dy"]), float(arrays["dx"])
     south = float(arrays["ymax"]) - height.shape[0] * d_lat

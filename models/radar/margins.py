@@ -39,14 +39,31 @@ def focused_size(
 ) -> tuple[float, float]:
     """Lines and cells of an echo that are focused, seen about zero Doppler from a slant range [m].
 
-    That is the range of its middle; the farthest cell takes the longest aperture. Less than zero
-    where it is too short for any.
+    That is the range of its middle; the farthest cell takes the longest aperture. Of an echo
+    shorter than an aperture those lines are focused that all of it sees, with a coarser resolution.
+    Less than zero where it is too short for any.
     """
+    columns = _focused_cells(radar, n_cells, slant_range, velocity)
+    half = max(columns, 0.0) / 2 * radar.range_spacing
+    duration = n_lines - 1
+    longer = duration - aperture_lines(radar, slant_range + half, velocity)
+    shorter = aperture_lines(radar, slant_range - half, velocity) - duration
+    return max(longer, shorter), columns
+
+
+def lines_needed(
+    radar: Radar, n_focused: int, n_cells: int, slant_range: float, velocity: float
+) -> float:
+    """Lines that an echo must have so that some of them are focused with the whole aperture."""
+    half = max(_focused_cells(radar, n_cells, slant_range, velocity), 0.0) / 2
+    far = slant_range + half * radar.range_spacing
+    return n_focused + 1 + aperture_lines(radar, far, velocity)
+
+
+def _focused_cells(radar: Radar, n_cells: int, slant_range: float, velocity: float) -> float:
     edge = np.array(radar.doppler_bandwidth / 2)
     lag = slant_range * (1 - float(migration_factor(edge, velocity, radar.wavelength)))
-    columns = n_cells - radar.n_pulse + 1 - lag / radar.range_spacing
-    far = slant_range + max(columns, 0.0) / 2 * radar.range_spacing
-    return n_lines - 1 - aperture_lines(radar, far, velocity), columns
+    return n_cells - radar.n_pulse + 1 - lag / radar.range_spacing
 
 
 def sigma_of(

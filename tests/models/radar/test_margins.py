@@ -5,7 +5,7 @@ import pytest
 
 from terrafix.models.radar.chirp import Radar
 from terrafix.models.radar.imaging import Imager
-from terrafix.models.radar.margins import aperture_lines, focused_size, sigma_of
+from terrafix.models.radar.margins import aperture_lines, focused_size, lines_needed, sigma_of
 
 RADAR = Radar(1.27e9, 2000.0, 16e6, -1e12, 4e-6, 200.0)
 
@@ -15,24 +15,26 @@ def test_the_aperture_is_that_of_the_formula():
     assert aperture_lines(RADAR, 700e3, 7100.0) == pytest.approx(655.584, abs=0.001)
 
 
-@pytest.mark.parametrize("velocity", [7000.0, 7400.0])
-def test_what_is_focused_is_what_the_processor_says(velocity):
-    """Of 900 lines by 160 cells; a row and a column are rounded."""
+@pytest.mark.parametrize(("velocity", "n"), [(7000.0, 900), (7400.0, 900), (7000.0, 500)])
+def test_what_is_focused_is_what_the_processor_says(velocity, n):
+    """Of 160 cells, a row and a column rounded; 500 lines are shorter than the aperture, 674."""
     rng = np.random.default_rng(3)
-    echo = (rng.standard_normal((900, 160)) + 1j * rng.standard_normal((900, 160))).astype(
-        np.complex64
-    )
+    echo = (rng.standard_normal((n, 160)) + 1j * rng.standard_normal((n, 160))).astype(np.complex64)
     near, middle = 700e3, 700e3 + 48 * RADAR.range_spacing  # of the columns that are focused
-    imager = Imager(echo, RADAR, near, -0.225, migration_step=1.0)
+    imager = Imager(echo, RADAR, near, -n / 2 / RADAR.prf, migration_step=1.0)
     image = imager.image(imager.processing(0.0, velocity, 0.0), velocity)
-    lines, cells = focused_size(RADAR, 900, 160, middle, velocity)
+    lines, cells = focused_size(RADAR, n, 160, middle, velocity)
     assert image.rows.stop - image.rows.start == pytest.approx(lines, abs=2)
     assert image.columns.stop - image.columns.start == pytest.approx(cells, abs=1)
 
 
-def test_an_echo_shorter_than_the_aperture_has_nothing_focused():
-    assert focused_size(RADAR, 600, 160, 700e3, 7100.0)[0] == pytest.approx(600 - 1 - 656, abs=1)
+def test_an_echo_shorter_than_a_pulse_has_nothing_focused():
     assert focused_size(RADAR, 600, 50, 700e3, 7100.0)[1] < 0
+
+
+def test_with_the_lines_that_are_needed_as_many_are_focused():
+    n = lines_needed(RADAR, 100, 160, 700e3, 7100.0)
+    assert focused_size(RADAR, round(n), 160, 700e3, 7100.0)[0] == pytest.approx(100, abs=0.5)
 
 
 def test_sigma_is_that_of_the_gradient():
