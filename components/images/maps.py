@@ -54,7 +54,7 @@ class InView(Component):
     v_e = Input((3,), unit="m/s", frame="e", doc="true velocity relative to the Earth")
     q_be = Input((4,), unit="1", frame="b", doc="true attitude, Earth-fixed to body")
 
-    def _beam(self, height: Height) -> tuple[Beam, float, float]:
+    def _beam(self, height: Height) -> tuple[Beam, tuple[float, float]]:
         """The beam, and latitude and longitude [rad] where it meets the ground, to some meters."""
         r, v, q_be, look, squint = (
             common(self, name) for name in ("r_e", "v_e", "q_be", "look", "squint")
@@ -68,7 +68,7 @@ class InView(Component):
             if not abs(rise) > _CLOSE:  # nor where it is not known
                 break
             h += 0.7 * rise
-        return Beam(r, v, beam.point), latitude, longitude
+        return Beam(r, v, beam.point), (latitude, longitude)
 
 
 class ReferenceMap(InView, ReferenceSource):
@@ -121,7 +121,7 @@ class ReferenceMap(InView, ReferenceSource):
         )
         source = self._map()
         try:
-            beam, *place = self._beam(lambda *at: float(dem.known_at(*at)))
+            beam, place = self._beam(lambda *at: float(dem.known_at(*at)))
             part = source.about(*place, _DIAGONAL * reach, spacing, dem.at)
             reference = as_seen(part, beam, reach, spacing, dem.at)
         except ValueError as error:
@@ -189,7 +189,7 @@ class ElevationMap(InView):
             return float(near.known_at(latitude, longitude))
 
         try:
-            _, *place = self._beam(height)
+            _, place = self._beam(height)
             dem = referred(self, elevations_about(raster, *place, reach))
         except ValueError as error:
             raise ConfigurationError(

@@ -57,6 +57,10 @@ _LONGEST = 32_000
 _MERIDIAN = 6371e3
 
 
+Ties = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""Rows, columns, and the latitudes, longitudes [rad] and heights [m] of tie points."""
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """A part of a map.
@@ -74,8 +78,7 @@ class Part:
     pixel : callable
         Row and column, fractional, of latitudes, longitudes [rad] and heights [m].
     ties : callable
-        Rows, columns, and the latitude, longitude [rad] and height [m] of tie points in its own
-        geometry.
+        In its own geometry.
     """
 
     name: str
@@ -83,7 +86,7 @@ class Part:
     size: float
     side: float
     pixel: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-    ties: Callable[[], tuple[FloatArray, ...]]
+    ties: Callable[[], Ties]
 
     def reference(self) -> Reference:
         """Reference in the geometry of the map.
@@ -195,10 +198,10 @@ def as_seen(part: Part, beam: Beam, reach: float, spacing: float, terrain: Heigh
         return np.stack(geodetic(p)[:2])
 
     place, height = _on_terrain(places, terrain)
-    row, column = part.pixel(*place, height)
+    row, column = part.pixel(place[0], place[1], height)
     amplitude = _drawn(part.amplitude, ties, row, column)
     _require_seen(part.name, float((amplitude > 0).mean()))
-    return Reference(amplitude, ties, ties, *place, height)
+    return Reference(amplitude, ties, ties, place[0], place[1], height)
 
 
 def _incidence(beam: Beam) -> float:
@@ -215,7 +218,7 @@ def _on_terrain(
     Along the height they are taken as parabolas. Where several heights do (layover), it is one.
     """
     start = places(0.0)
-    h = np.asarray(terrain(*start), np.float64)
+    h = np.asarray(terrain(start[0], start[1]), np.float64)
     low, high = float(h.min()) - _RELIEF, float(h.max()) + _RELIEF
     middle, half = (low + high) / 2, (high - low) / 2
     a, b, c = (places(x) for x in (low, middle, high))
@@ -224,7 +227,7 @@ def _on_terrain(
     for _ in range(_ROUNDS):
         u = np.clip((h - middle) / half, -1, 1)
         found = b + slope * u + bend * u * u
-        rise = np.asarray(terrain(*found), np.float64) - h
+        rise = np.asarray(terrain(found[0], found[1]), np.float64) - h
         if np.abs(rise).max() < _LEVEL:
             break
         h = h + 0.7 * rise
@@ -288,7 +291,7 @@ class RasterMap:
                 rows.start + full_index(i, step), columns.start + full_index(j, step)
             )
 
-        def ties() -> tuple[FloatArray, ...]:
+        def ties() -> Ties:
             error = CLOSE * size * step / _MERIDIAN * np.array([1, 1 / np.cos(latitude)])
             last = [float(n - 1) for n in amplitude.shape]
             i, j, places = knots(place, (0, last[0]), (0, last[1]), error)
@@ -332,7 +335,7 @@ class Sentinel1Map:
             i, j = (multilook_index(a - own.start, n) for a, own, n in at)
             return i, j
 
-        def ties() -> tuple[FloatArray, ...]:
+        def ties() -> Ties:
             i, j = (np.linspace(0, n - 1, max(2, n // _TIES)) for n in amplitude.shape)
             t, R = image.seen_at(
                 lines.start + full_index(i, looks[0])[:, None],
