@@ -22,6 +22,8 @@ from terrafix.cosim.system.system import System
 from terrafix.models.images.matching import REASONS
 from terrafix.models.images.reference import Reference, write_reference
 from terrafix.models.maps.dem import Dem, flat_dem, write_dem
+from terrafix.models.radar.imaging import OPEN
+from terrafix.models.radar.imaging import REASONS as IMAGES
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 DATA = Path(os.environ.get("TERRAFIX_DATA", EXAMPLES / ".." / ".." / "shared" / "data"))
@@ -128,6 +130,18 @@ def test_where_autofocus_refuses_the_fix_comes_without_a_velocity(monkeypatch):
     assert (at_fix(data, "correct.innovation.accepted") == 1).all()
     assert (at_fix(data, "correct.innovation.dof") == 3).all()
     assert (at_fix(data, "former.reason") == 4).all()
+
+
+def test_a_member_without_an_image_goes_without_a_fix():
+    """It believes its velocity to 4 km/s: any Doppler centroid is possible. The other flies on."""
+    system = small()
+    sigma = np.array([10.0, 4000.0])
+    system.disperse(Dispersion("lost", ("last_known.velocity_sigma",), sigma, kind="list"))
+    data = simulate(system, members=2, duration="9").dataset
+    assert [IMAGES[int(k)] for k in at_fix(data, "former.reason")] == ["accepted", OPEN]
+    assert at_fix(data, "matcher.reason")[0] == 0
+    assert at_fix(data, "correct.innovation.accepted")[0] == 1
+    assert np.isfinite(data["correct.estimate.r_e"].to_numpy()[-1]).all()  # neither is failed
 
 
 def test_what_is_not_recognized_gives_no_fix():

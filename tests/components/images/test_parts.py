@@ -17,6 +17,7 @@ from terrafix.cosim.declare.component import Environment
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.geolocation import ground_point
 from terrafix.models.maps.dem import flat_dem
+from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.radar.boresight import boresight_on_terrain
 from terrafix.models.radar.chirp import SPEED_OF_LIGHT
 from terrafix.models.radar.imaging import BLIND, OPEN, REASONS
@@ -211,6 +212,12 @@ def test_the_velocity_that_focuses_falls_with_range():
     assert field.velocity == pytest.approx(middle, rel=1e-4)
     assert field.by_range == pytest.approx((far - near) / 2000.0, rel=0.02)
     assert field.by_range < -1e-4  # 0.13 m/s in a kilometer
+    arc = OrbitArc(R_E, V_E, 0.0, 2.0, 2.0)
+    early, late = (
+        effective_velocity_array(r, v, ground_point(r, v, 861013.0, sine))
+        for r, v in ((arc.position(t), arc.velocity(t)) for t in (-1.5, 1.5))
+    )
+    assert field.by_time == pytest.approx((late - early) / 3.0, rel=0.02)
     # variances 4, 5, 6 of velocity: that along the track, times the speed over the effective one
     variance = V_E @ np.diag([4.0, 5.0, 6.0]) @ V_E / middle**2
     assert sigma == pytest.approx(np.sqrt(variance), rel=1e-4)

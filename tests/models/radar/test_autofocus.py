@@ -144,15 +144,26 @@ def test_the_grid_of_the_climb_moves_no_estimate(points, step):
 
 
 def test_ships_count_for_no_more_than_what_rests(points):
-    """One target in five moves, all the same way and 7 dB brighter: the mean would be off 0.5 m/s.
+    """One target in five moves, all at 1.6 m/s: the mean is off by 0.32 m/s, Huber's by 0.07."""
+    errors = []
+    for seed in range(3):
+        rng = np.random.default_rng([6, seed])
+        bright = targets(rng, 60, 22.0) + targets(rng, 15, 25.0, lambda: 1.6)
+        found = autofocus(curve_of(points, speckle(rng), bright), VELOCITY)
+        assert found.accepted
+        errors.append(found.velocity - VELOCITY)
+    assert abs(np.mean(errors)) < 0.15
 
-    Huber's estimate moves by what a fifth of all blocks at its reach, and no more, do.
-    """
+
+def test_what_outshines_all_is_not_what_most_blocks_show(points):
+    """Ships 7 dB above all else draw the peak of the parts to them, 2.5 m/s away."""
     rng = np.random.default_rng(6)
     bright = targets(rng, 60, 22.0) + targets(rng, 15, 29.0, lambda: 2.5)
-    found = autofocus(curve_of(points, speckle(rng), bright), VELOCITY)
+    curve = curve_of(points, speckle(rng), bright)
+    assert max(range(7180, 7200), key=curve.at) >= 7190
+    found = autofocus(curve, VELOCITY)
     assert found.accepted
-    assert abs(found.velocity - VELOCITY) < 0.1
+    assert abs(found.velocity - VELOCITY) < 0.15
 
 
 def test_the_change_of_velocity_along_the_track_is_taken_off(points):
