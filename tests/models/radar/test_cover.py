@@ -21,7 +21,7 @@ def test_any_window_shows_the_same(cover):
     one = scene(cover, points_per_km2=50.0)
     rows, columns = range(ROWS.start + 77, ROWS.stop), range(COLUMNS.start + 301, COLUMNS.stop)
     whole, part = one.texture(ROWS, COLUMNS), one.texture(rows, columns)
-    np.testing.assert_allclose(part, whole[77:, 301:], rtol=0, atol=1e-5)  # [dB], of rounding
+    np.testing.assert_allclose(part, whole[77:, 301:], rtol=0, atol=1e-4)  # [dB], of rounding
     latitude, longitude, *rest = one.points(ROWS, COLUMNS)
     inside = (latitude >= rows.start * CELL) & (longitude >= columns.start * CELL)
     for found, expected in zip(
@@ -53,12 +53,12 @@ def test_a_town_has_points_on_a_250th_of_its_cells_and_none_on_streets():
 
 
 def test_the_sea_is_dark_and_calm_and_every_image_has_some():
-    one = scene("coast", points_per_km2=30.0, parcels_db=0.0, smooth_db=0.0)
+    one = scene("coast", points_per_km2=30.0, parcels_db=0.0, smooth_db=0.0, seed=5)
     texture = one.texture(ROWS, COLUMNS)
     land = one._land(ROWS, COLUMNS) > 0
     # means of 20,000 cells and more that differ by 1.5 dB, correlated over a few
     assert np.mean(texture[land]) - np.mean(texture[~land]) == pytest.approx(-SEA_DB, abs=0.1)
-    assert np.std(scene("coast").texture(ROWS, COLUMNS)[~land]) < 0.4
+    assert np.std(scene("coast", seed=5).texture(ROWS, COLUMNS)[~land]) < 0.4
     for k in range(8):
         rows = range(100_000 * k, 100_000 * k + len(ROWS))
         assert 0.03 < scene("coast", seed=k)._land(rows, COLUMNS).mean() < 0.97
@@ -66,7 +66,9 @@ def test_the_sea_is_dark_and_calm_and_every_image_has_some():
     i = np.rint(latitude / CELL).astype(int) - ROWS.start
     j = np.rint(longitude / CELL).astype(int) - COLUMNS.start
     inside = (i < len(ROWS)) & (j < len(COLUMNS))
-    assert inside.sum() > 100
+    side = CELL * 6371.0  # [km]
+    n = 30.0 * land.sum() * side**2 * np.cos(ROWS.start * CELL)
+    assert inside.sum() == pytest.approx(n, abs=5 * np.sqrt(n))
     assert land[i[inside], j[inside]].all()
 
 
