@@ -368,7 +368,7 @@ class RecordedReference(ReferenceSource):
             )
             velocity = float(effective_velocity_array(r, v, beam.point))
             sine = radar.wavelength * centroid / (2 * np.linalg.norm(v))
-            field = velocity_field(r, v, beam.slant_range, float(sine))
+            field = velocity_field(r, v, beam.slant_range, float(sine), beam.side)
             processing, focus = imager.focus(
                 [imager.processing(centroid, velocity, field.by_range)],
                 velocity,
