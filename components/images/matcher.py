@@ -79,11 +79,12 @@ class ImageMatcher(OnReference):
             index = int(self.image.index[m])
             if index not in chips:
                 chips[index] = Searchable(self.images[index])
-            match = self._matched(m, chips[index], searchable, reference, dem)
+            view = self._view(m)
+            match = self._matched(m, view, chips[index], searchable, reference, dem)
             if match.accepted:
                 try:
-                    v, sigma = self.prior.v_e[m], self.reference_sigma[m]
-                    places[m], D[m] = placed(reference, dem.at, match, v, sigma)
+                    sigma = self.reference_sigma[m]
+                    places[m], D[m] = placed(reference, dem.at, match, view, sigma)
                     valid[m] = True
                 except ValueError:
                     match = refused("its place has no height")
@@ -97,14 +98,12 @@ class ImageMatcher(OnReference):
             return
         self._publish(t, places, D, valid)
 
-    def _matched(
-        self, m: int, chip: Searchable, searchable: Searchable, reference: Reference, dem: Dem
-    ) -> Match:
-        """Match of a member's image, where its estimate predicts it."""
-        image, prior = self.image, self.prior
-        view = View(
-            prior.r_e[m],
-            prior.v_e[m],
+    def _view(self, m: int) -> View:
+        """How a member's image was seen, as its estimate has it."""
+        image = self.image
+        return View(
+            self.prior.r_e[m],
+            self.prior.v_e[m],
             float(image.row[m]),
             float(image.column[m]),
             float(image.row_time[m]),
@@ -115,7 +114,18 @@ class ImageMatcher(OnReference):
             float(image.time_sigma[m]),
             float(self.range_sigma[m]),
         )
-        P = np.asarray(prior.P[m])[:6, :6]
+
+    def _matched(
+        self,
+        m: int,
+        view: View,
+        chip: Searchable,
+        searchable: Searchable,
+        reference: Reference,
+        dem: Dem,
+    ) -> Match:
+        """Match of a member's image, where its estimate predicts it."""
+        P = np.asarray(self.prior.P[m])[:6, :6]
         try:
             where = predicted(view, P, reference, dem.known_at, chip.shape)
         except ValueError:

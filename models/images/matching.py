@@ -578,9 +578,7 @@ def _allowed(shifts: list[FloatArray], covariance: FloatArray) -> NDArray[np.boo
     return np.asarray(square <= _SIGMAS**2)
 
 
-def _standing_out(
-    surface: Single, allowed: NDArray[np.bool_]
-) -> tuple[int, int, float] | None:
+def _standing_out(surface: Single, allowed: NDArray[np.bool_]) -> tuple[int, int, float] | None:
     """The highest allowed peak, and the chance that a wrong one stands out as much."""
     where = np.where(allowed, surface, -np.inf)
     i, j = (int(k) for k in np.unravel_index(where.argmax(), where.shape))
@@ -648,9 +646,7 @@ def _aligned(
     return _Aligned(transform, covariance[np.ix_([0, 3], [0, 3])], correlation, linear)
 
 
-def _moved(
-    transform: FloatArray, step: FloatArray, center: FloatArray, unit: float
-) -> FloatArray:
+def _moved(transform: FloatArray, step: FloatArray, center: FloatArray, unit: float) -> FloatArray:
     """A transform (2, 3) of an image that is first shifted and deformed about its center."""
     shift, slopes = step.reshape(2, 3)[:, 0], step.reshape(2, 3)[:, 1:]
     A = np.eye(2) + slopes / unit

@@ -69,7 +69,9 @@ def test_a_turned_and_scaled_chip_is_found(scene, angle, scale):
     mean, reference, rng = scene
     center = (310.3, 287.6)
     chip = speckled(cut(mean, center, SIZE, angle, scale).astype(np.float64), rng)
-    match = matched(Searchable(chip), reference, expected(center, off=(9, -7), turn=0.1, growth=0.03))
+    match = matched(
+        Searchable(chip), reference, expected(center, off=(9, -7), turn=0.1, growth=0.03)
+    )
     assert match.reason == "accepted"
     assert (match.row, match.column) == pytest.approx(center, abs=0.4)
     assert match.shift == pytest.approx([-9, 7], abs=0.4)
@@ -176,7 +178,9 @@ def test_a_stretch_that_the_orbit_leaves_open_does_not_move_the_center(scene):
 def test_another_point_than_the_middle_can_be_asked_for(scene):
     mean, reference, rng = scene
     chip = Searchable(speckled(cut(mean, (300, 300), SIZE).astype(np.float64), rng))
-    middle, corner = (matched(chip, reference, expected((300, 300)), c) for c in (None, (20.0, 40.0)))
+    middle, corner = (
+        matched(chip, reference, expected((300, 300)), c) for c in (None, (20.0, 40.0))
+    )
     assert corner.row - middle.row == pytest.approx(20 - 127.5, abs=0.5)
     assert corner.column - middle.column == pytest.approx(40 - 127.5, abs=0.5)
     assert np.linalg.det(corner.covariance) > np.linalg.det(middle.covariance)
