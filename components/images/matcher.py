@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from terrafix.components.fields import ESTIMATE, FIX, IMAGE
@@ -20,10 +22,19 @@ from terrafix.cosim.declare.ports import (
 )
 from terrafix.models.geometry.geodesy import geodetic
 from terrafix.models.geometry.geolocation import ground_point
-from terrafix.models.images.matching import REASONS, Match, Searchable, matched, refused
+from terrafix.models.images.matching import (
+    REASONS,
+    Match,
+    Searchable,
+    matched,
+    misplaced,
+    refused,
+)
 from terrafix.models.images.placing import View, placed, predicted
 from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import Dem
+
+_log = logging.getLogger(__name__)
 
 
 class ImageMatcher(OnReference):
@@ -64,6 +75,9 @@ class ImageMatcher(OnReference):
     )
     outline = SharedOutput((4, 2), doc="corners of the first image on it; NaN if not found")
 
+    def _initialize_impl(self) -> None:
+        self._told = False
+
     def _step_impl(self, t: float, dt: float) -> None:
         fresh = self.image.fresh & self.environment.active
         if not fresh.any():
@@ -95,6 +109,7 @@ class ImageMatcher(OnReference):
         self.inliers, self.outline = matches[0].blocks, matches[0].outline
         if not valid.any():
             self._require_coverage(reference, fresh)
+            self._tell_misplaced(int(np.argmax(fresh)), chips, searchable, reference, dem)
             return
         self._publish(t, places, D, valid)
 
@@ -131,6 +146,31 @@ class ImageMatcher(OnReference):
         except ValueError:
             return refused("what is estimated sees no ground")
         return matched(chip, searchable, where, (view.row, view.column))
+
+    def _tell_misplaced(
+        self,
+        m: int,
+        chips: dict[int, Searchable],
+        searchable: Searchable,
+        reference: Reference,
+        dem: Dem,
+    ) -> None:
+        """Say once whether an image is recognized that is turned, or of another spacing."""
+        if self._told:
+            return
+        self._told = True
+        P, chip = np.asarray(self.prior.P[m])[:6, :6], chips[int(self.image.index[m])]
+        try:
+            where = predicted(self._view(m), P, reference, dem.known_at, chip.shape)
+        except ValueError:
+            return
+        found = misplaced(chip, searchable, where)
+        if found is not None:
+            _log.warning(
+                "'%s' recognizes its image on the reference turned by %.0f deg and with pixels "
+                "%+.0f %% of the size that its tie points say: they do not belong to what it shows",
+                *(self.name, np.degrees(found[0]), 100 * found[1]),
+            )
 
     def _publish(self, t: float, r_f_e: FloatArray, D: FloatArray, valid: Mask) -> None:
         n, image = self.n_members, self.image

@@ -116,10 +116,11 @@ def predicted(
         low, high = searched_span(n, float(np.sqrt(variance)))
         count = int(np.clip(np.ceil((high - low) / _SPACING) + 1, 2, _MOST_NODES))
         axes.append(np.linspace(low, high, count))
-    latitude, longitude, height = _on_terrain(view, *axes, terrain)
+    rows, columns = axes
+    latitude, longitude, height = _on_terrain(view, rows, columns, terrain)
     row, column, inside = reference.pixel(latitude, longitude, height)
     places = _smooth(np.stack([row, column], axis=-1), inside)
-    return Prediction(axes[0], axes[1], places, covariance, linear)
+    return Prediction(rows, columns, places, covariance, linear)
 
 
 def _smooth(places: FloatArray, inside: NDArray[np.bool_]) -> FloatArray:
