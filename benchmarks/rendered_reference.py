@@ -42,11 +42,11 @@ def trial(number: int, dem: Dem, options: argparse.Namespace) -> dict[str, objec
     if not options.classes:
         cover = CoverMap(known, cover="texture")
     displaced = options.placing * rng.standard_normal(2)
-    # the orbit that is expected is 1 km off, in heading and incidence by what that makes
-    off = 1000.0 * rng.standard_normal(2) / EARTH_RADIUS
-    planned = footprint(known, place + off, AROUND, heading=turn, off=600 * rng.standard_normal(3))
+    # what is rendered is for an orbit some kilometer off
+    off = 600.0 * rng.standard_normal(3)
+    planned = footprint(known, place, AROUND, heading=turn, off=off)
     reference = rendered(cover, planned, LOOKS, displaced=tuple(displaced))
-    match = found(image, reference)
+    match = found(image, reference, known, rng)
     row, column, inside = reference.pixel(image.place[0], image.place[1])
     out = {"accepted": match.accepted, "reason": match.reason, "inside": bool(inside)}
     if match.accepted:
@@ -62,9 +62,6 @@ def trial(number: int, dem: Dem, options: argparse.Namespace) -> dict[str, objec
         out["meters"] = (ahead @ [n, e], right @ [n, e], -d)
         out["sigma"] = match.sigma
     return out
-
-
-EARTH_RADIUS = 6371e3
 
 
 def main() -> None:
