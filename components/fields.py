@@ -65,6 +65,8 @@ ACQUISITION = {
     "near_range": Field((), "m", doc="slant range of the first cell"),
     "beam_range": Field((), "m", doc="slant range to where the beam's center meets the ground"),
     "beam_doppler": Field((), "Hz", doc="absolute Doppler frequency of the beam's center"),
+    "time_sigma": Field((), "s", doc="standard error of the times of its lines"),
+    "side": Field((), "1", doc="1: to the right of the track, -1: to the left"),
 }
 """When and where an echo was received; valid at the time its middle line was."""
 
@@ -77,6 +79,10 @@ IMAGE = {
     "velocity": Field((), "m/s", doc="effective velocity that focuses it"),
     "velocity_sigma": Field((), "m/s", doc="standard error of that velocity"),
     "focused": Field((), "1", doc="1 where autofocus named that velocity, 0 where it refused"),
+    "row_time": Field((), "s", doc="from row to row, when the beam's center passes"),
+    "column_range": Field((), "m", doc="slant range from column to column"),
+    "time_sigma": Field((), "s", doc="standard error of the times of its rows"),
+    "side": Field((), "1", doc="1: to the right of the track, -1: to the left"),
 }
 """An image formed with a member's own estimate."""
 

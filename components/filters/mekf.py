@@ -125,7 +125,9 @@ class MekfCorrect(SymbolicComponent):
     jacobian = Choice(
         JACOBIANS, "exact", doc="wrong-sign: of the misalignment's part (negative control)"
     )
-    look = Parameter(unit="rad", doc="off-nadir angle of the nominal boresight, to the right")
+    look = Parameter(
+        unit="rad", doc="off-nadir angle of the nominal boresight, positive to the right"
+    )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     underweighting = Parameter(0.2, minimum=0.0, doc="Lear's factor on H P H'")
     underweighted_updates = Parameter(0.0, minimum=0.0, doc="how many fixes it applies to")

@@ -48,7 +48,7 @@ class ImageFormer(Component):
     default_rate = Rate("8.2", offset="8.2")
 
     look = Parameter(
-        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+        unit="rad", doc="off-nadir angle of the nominal boresight, positive to the right"
     )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     velocity_step = Parameter(1.0, unit="m/s", positive=True, doc="grid of autofocus")
@@ -95,12 +95,13 @@ class ImageFormer(Component):
         if not fresh.any():
             return
         k = int(np.argmax(fresh))
-        for name in ("near_range", "first_time"):
+        for name in ("near_range", "first_time", "side"):
             if np.any(getattr(self.acquired, name)[fresh] != getattr(self.acquired, name)[k]):
                 raise ConfigurationError(
                     f"'{self.name}.acquired.{name}' differs between members, but one echo is "
                     "shared by all of them\n  fly one member at a time"
                 )
+        self._require_side(fresh)
         try:
             imager = Imager(
                 self.echo,
@@ -168,6 +169,12 @@ class ImageFormer(Component):
         values["slant_range"] = beam_range + self.range_sigma * noise
         speed = np.linalg.norm(self.prior.v_e, axis=1)
         values["sine"] = wavelength * beam_doppler / (2 * speed)
+        values["row_time"] = np.full(self.n_members, self.azimuth_looks / imager.radar.prf)
+        values["column_range"] = np.full(
+            self.n_members, self.range_looks * imager.radar.range_spacing
+        )
+        values["time_sigma"] = self.acquired.time_sigma
+        values["side"] = self.acquired.side
         self.images = np.stack(chips)
         self.image.publish(t, valid=formed, **values)
 
@@ -200,9 +207,28 @@ class ImageFormer(Component):
         r, v = self.prior.r_e[m], self.prior.v_e[m]
         sine = wavelength * self.acquired.beam_doppler[m] / (2 * np.linalg.norm(v))
         ranges = self.acquired.beam_range[m] + np.array([0.0, -_HALF_SWATH, _HALF_SWATH])
-        p = ground_point(r, v, ranges, sine)
+        p = ground_point(r, v, ranges, sine, side=self._side(m))
         own, near, far = (float(x) for x in effective_velocity_array(r, v, p))
         return own, (far - near) / (2 * _HALF_SWATH)
+
+    def _require_side(self, fresh: Mask) -> None:
+        """Raise where all who look at an echo look to the other side than it came from."""
+        r, v = self.prior.r_e[fresh], self.prior.v_e[fresh]
+        q_sb = nominal_antenna_array(self.look, self.squint)
+        u = boresight_direction_array(self.q_be, q_sb, self.prior.q_mu)[fresh]
+        across = np.sum(u * np.cross(v, r), axis=1)
+        if not (across * self.acquired.side[fresh] < 0).all():
+            return
+        own, other = ("right", "left") if across[0] > 0 else ("left", "right")
+        look = np.degrees(self.look[fresh][0])
+        raise ConfigurationError(
+            f"'{self.name}' looks to the {own} of the track, but its echo came from the {other}\n"
+            f"  its look is {look:.4g} deg, positive to the right: set {self.name}.look to that of "
+            "what received the echo, here and wherever the chain declares it"
+        )
+
+    def _side(self, m: int) -> int:
+        return 1 if self.acquired.side[m] > 0 else -1
 
     def _expected_centroid(self, wavelength: float) -> tuple[FloatArray, FloatArray]:
         """Doppler centroid that each estimate implies, and its standard deviation."""

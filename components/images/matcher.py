@@ -9,7 +9,7 @@ from terrafix.components.images.reference import OnReference
 from terrafix.cosim.basics.arrays import FloatArray, Mask
 from terrafix.cosim.basics.clock import Rate
 from terrafix.cosim.basics.errors import ConfigurationError
-from terrafix.cosim.declare.parameters import Choice, Parameter
+from terrafix.cosim.declare.parameters import Parameter
 from terrafix.cosim.declare.ports import (
     BundleInput,
     MessageInput,
@@ -18,9 +18,10 @@ from terrafix.cosim.declare.ports import (
     SharedInput,
     SharedOutput,
 )
-from terrafix.models.geometry.geodesy import ecef, geodetic
-from terrafix.models.geometry.geolocation import ground_point, track_axes
-from terrafix.models.images.matching import KINDS, REASONS, Match, Searchable, matched
+from terrafix.models.geometry.geodesy import geodetic
+from terrafix.models.geometry.geolocation import ground_point
+from terrafix.models.images.matching import REASONS, Match, Searchable, matched, refused
+from terrafix.models.images.placing import View, placed, predicted
 from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import Dem
 
@@ -28,20 +29,25 @@ from terrafix.models.maps.dem import Dem
 class ImageMatcher(OnReference):
     """Finds the image on the reference, its center's place and height, and publishes the fix.
 
+    Where the image lies on the reference, and how far off that can be, is predicted with the prior.
     The fix is that of the open loop: the boresight's tangents are zero by construction, the range
     is measured, the in-track velocity is the effective one where autofocus named it, and absent
-    where it refused. No fix comes of an image that is not recognized.
+    where it refused. No fix comes of an image that is not recognized: `reason` says why.
+
+    The covariance D of the place is that of the match and of the reference: see
+    `terrafix.models.images.placing`. That of y, R, has the noise of the slant range, and of the
+    first tangent how far the antenna moves in the standard error of the image's time.
     """
 
     default_rate = Rate("8.2", offset="8.2")
 
-    transform = Choice(KINDS, "similarity", doc="between the features of image and reference")
-    geolocation_sigma = Parameter(
-        5.0,
+    reference_sigma = Parameter(
+        [5.0, 5.0, 10.0],
         shape=(3,),
         unit="m",
-        positive=True,
-        doc="error of the recognized place: along the track, across it, up",
+        minimum=0.0,
+        doc="error of the reference's places along the track and across it, and of the heights, "
+        "their datum included",
     )
     range_sigma = Parameter(1.0, unit="m", positive=True, doc="noise of the slant range")
 
@@ -51,9 +57,11 @@ class ImageMatcher(OnReference):
 
     fix = MessageOutput(fields=FIX, doc="the fix")
     reason = Output(doc="of the last image: index into terrafix.models.images.matching.REASONS")
-    match_sigma = Output(doc="of the last image: standard error of its place [pixels]")
+    match_sigma = Output(doc="of the last image: largest standard error of its place [pixels]")
     match_place = Output((2,), labels=("row", "column"), doc="of its center on the reference")
-    inliers = SharedOutput((None, 4), doc="features of the first image and of the reference")
+    inliers = SharedOutput(
+        (None, 4), doc="middles of the parts of the first image that agree, on it and the reference"
+    )
     outline = SharedOutput((4, 2), doc="corners of the first image on it; NaN if not found")
 
     def _step_impl(self, t: float, dt: float) -> None:
@@ -62,56 +70,67 @@ class ImageMatcher(OnReference):
             return
         reference, dem = self._covered_reference(), self._dem()
         searchable = Searchable(reference.amplitude)
-        found: dict[tuple[int, float, float], Match] = {}
-        places = np.zeros((self.n_members, 3))
-        valid = np.zeros(self.n_members, np.bool_)
-        for m in np.flatnonzero(fresh):
-            key = (
-                int(self.image.index[m]),
-                float(self.image.row[m]),
-                float(self.image.column[m]),
-            )
-            if key not in found:
-                chip = Searchable(self.images[key[0]])
-                found[key] = matched(chip, searchable, key[1:], kind=self.transform)
-            match = found[key]
+        chips: dict[int, Searchable] = {}
+        n = self.n_members
+        places, D = np.zeros((n, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
+        valid = np.zeros(n, np.bool_)
+        matches: list[Match] = []
+        for m in map(int, np.flatnonzero(fresh)):
+            index = int(self.image.index[m])
+            if index not in chips:
+                chips[index] = Searchable(self.images[index])
+            match = self._matched(m, chips[index], searchable, reference, dem)
+            if match.accepted:
+                try:
+                    v, sigma = self.prior.v_e[m], self.reference_sigma[m]
+                    places[m], D[m] = placed(reference, dem.at, match, v, sigma)
+                    valid[m] = True
+                except ValueError:
+                    match = refused("its place has no height")
             self.reason[m] = REASONS.index(match.reason)
             self.match_sigma[m] = match.sigma.max() if match.accepted else np.nan
             self.match_place[m] = match.row, match.column
-            if match.accepted:
-                try:
-                    places[m] = self._placed(reference, dem, match)
-                except ValueError as error:
-                    self.fail(np.arange(self.n_members) == m, f"cannot place its image: {error}")
-                    continue
-                valid[m] = True
-        first = next(iter(found.values()))
-        self.inliers = first.inliers
-        rows, columns = self.images.shape[1:]
-        corners = [(0, 0, 1), (0, columns - 1, 1), (rows - 1, columns - 1, 1), (rows - 1, 0, 1)]
-        self.outline = np.array(corners) @ first.transform.T
+            matches.append(match)
+        self.inliers, self.outline = matches[0].blocks, matches[0].outline
         if not valid.any():
             self._require_coverage(reference, fresh)
             return
-        self._publish(t, places, valid)
+        self._publish(t, places, D, valid)
 
-    def _publish(self, t: float, places: FloatArray, valid: Mask) -> None:
-        n = self.n_members
-        r_f_e, D = np.zeros((n, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
-        r_f_e[valid] = ecef(*places[valid].T)
-        axes = track_axes(r_f_e[valid], self.prior.v_e[valid])
-        variance = self.geolocation_sigma[valid] ** 2
-        D[valid] = np.einsum("nki,nk,nkj->nij", axes, variance, axes)
+    def _matched(
+        self, m: int, chip: Searchable, searchable: Searchable, reference: Reference, dem: Dem
+    ) -> Match:
+        """Match of a member's image, where its estimate predicts it."""
+        image, prior = self.image, self.prior
+        view = View(
+            prior.r_e[m],
+            prior.v_e[m],
+            float(image.row[m]),
+            float(image.column[m]),
+            float(image.row_time[m]),
+            float(image.slant_range[m]),
+            float(image.column_range[m]),
+            float(image.sine[m]),
+            1 if image.side[m] > 0 else -1,
+            float(image.time_sigma[m]),
+            float(self.range_sigma[m]),
+        )
+        P = np.asarray(prior.P[m])[:6, :6]
+        try:
+            where = predicted(view, P, reference, dem.known_at, chip.shape)
+        except ValueError:
+            return refused("what is estimated sees no ground")
+        return matched(chip, searchable, where, (view.row, view.column))
+
+    def _publish(self, t: float, r_f_e: FloatArray, D: FloatArray, valid: Mask) -> None:
+        n, image = self.n_members, self.image
         y, R, present = np.zeros((n, 4)), np.zeros((n, 4, 4)), np.ones((n, 4))
-        y[:, 2], y[:, 3] = self.image.slant_range, self.image.velocity
-        R[:, 2, 2], R[:, 3, 3] = self.range_sigma**2, self.image.velocity_sigma**2
-        present[:, 3] = self.image.focused
+        y[:, 2], y[:, 3] = image.slant_range, image.velocity
+        speed = np.linalg.norm(self.prior.v_e, axis=1)
+        R[:, 0, 0] = (speed * image.time_sigma / image.slant_range) ** 2
+        R[:, 2, 2], R[:, 3, 3] = self.range_sigma**2, image.velocity_sigma**2
+        present[:, 3] = image.focused
         self.fix.publish(t, valid=valid, y=y, r_f_e=r_f_e, R=R, D=D, present=present)
-
-    def _placed(self, reference: Reference, dem: Dem, match: Match) -> tuple[float, float, float]:
-        """Latitude, longitude [rad] and height of the terrain [m] where an image lies."""
-        latitude, longitude, _ = reference.place(match.row, match.column)
-        return float(latitude), float(longitude), float(dem.at(latitude, longitude))
 
     def _covered_reference(self) -> Reference:
         reference = self._reference()
@@ -130,7 +149,10 @@ class ImageMatcher(OnReference):
         """Raise where nothing was recognized because the reference is of another place."""
         r, v, P = (getattr(self.prior, k)[fresh] for k in ("r_e", "v_e", "P"))
         try:
-            p = ground_point(r, v, self.image.slant_range[fresh], self.image.sine[fresh])
+            side = 1 if self.image.side[fresh][0] > 0 else -1
+            p = ground_point(
+                *(r, v, self.image.slant_range[fresh], self.image.sine[fresh]), side=side
+            )
         except ValueError:  # an estimate that sees no ground says nothing of the reference
             return
         latitude, longitude, _ = geodetic(p)

@@ -105,7 +105,7 @@ class EarlierPass(_Reference):
     """
 
     look = Parameter(
-        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+        unit="rad", doc="off-nadir angle of the nominal boresight, positive to the right"
     )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     displacement = Parameter(
@@ -150,6 +150,7 @@ class EarlierPass(_Reference):
                 beam.slant_range - (self.n_cells - 1) / 2 * radar.range_spacing,
                 self.n_cells,
                 beam.doppler(radar.wavelength),
+                side=beam.side,
             )
             reference = self._seen(scene, footprint, looks, float(snr))
         except ValueError as error:
@@ -303,7 +304,7 @@ class RecordedReference(_Reference):
         [0.0, 1.0], shape=(2,), minimum=0.0, maximum=1.0, doc="part of the Doppler band shown"
     )
     look = Parameter(
-        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+        unit="rad", doc="off-nadir angle of the nominal boresight, positive to the right"
     )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
     exposure = Parameter(
@@ -367,7 +368,7 @@ class RecordedReference(_Reference):
             reach = abs(first_time) + 3 * duration
             arc = OrbitArc(r, v, 0.0, reach, reach)
             looks = self.azimuth_looks, self.range_looks
-            reference = geocoded(image, arc, dem.at, looks)
+            reference = geocoded(image, arc, dem.at, looks, side=beam.side)
         except ValueError as error:
             raise ConfigurationError(
                 f"'{self.name}' cannot make a reference of '{path.name}': {error}"

@@ -78,7 +78,7 @@ class _Echo(SendsChirps):
     default_rate = Rate("8.2", offset="8.2")
 
     look = Parameter(
-        unit="rad", positive=True, doc="off-nadir angle of the nominal boresight, to the right"
+        unit="rad", doc="off-nadir angle of the nominal boresight, positive to the right"
     )
     squint = Parameter(0.0, unit="rad", doc="forward angle of the nominal boresight")
 
@@ -127,6 +127,8 @@ class _Echo(SendsChirps):
             near_range=near,
             beam_range=beam.slant_range,
             beam_doppler=beam.doppler(radar.wavelength),
+            time_sigma=0.0,
+            side=beam.side,
         )
 
 
@@ -180,6 +182,7 @@ class SceneEcho(_Echo):
                 near,
                 beam.doppler(radar.wavelength),
                 float(common(self, "antenna_length")),
+                side=beam.side,
             )
             scene = scene_from(self.height, self.grid, self.surface)
             snr = float(common(self, "snr"))

@@ -1,7 +1,7 @@
 r"""From a place in a radar image to a place on Earth, and back.
 
 A pixel is what was seen at time :math:`t` and slant range :math:`R` with Doppler frequency
-:math:`f`. On a surface of given height that is one point :math:`p` to the right of the track,
+:math:`f`. On a surface of given height that is one point :math:`p` on each side of the track,
 
 .. math::
     \lVert p - r(t) \rVert = R, \qquad
@@ -126,6 +126,7 @@ def ground_point_on_terrain(
     sine: ArrayLike,
     terrain: Height,
     start: ArrayLike = 0.0,
+    side: int = 1,
 ) -> FloatArray:
     """Point on a terrain that is seen at a range and a Doppler frequency.
 
@@ -140,10 +141,12 @@ def ground_point_on_terrain(
         Height [m] at latitudes and longitudes [rad].
     start : array_like
         Height to begin with [m].
+    side : {1, -1}
+        To the right of the track, or to the left.
     """
     h = np.asarray(start, dtype=np.float64)
     for _ in range(_STEPS):
-        p = ground_point(r, v, slant_range, sine, h)
+        p = ground_point(r, v, slant_range, sine, h, side)
         latitude, longitude, _ = geodetic(p)
         found = terrain(latitude, longitude)
         if np.abs(found - h).max(initial=0.0) < 1e-3:

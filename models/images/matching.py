@@ -1,94 +1,199 @@
-r"""Co-registration of a radar image with a larger reference.
+r"""Co-registration of a radar image with a larger reference, from what an orbit predicts.
 
-Features of both (SIFT on blurred logarithms of amplitude, in which speckle is additive) are
-matched; random sampling finds the similarity or affine transform that most of them share. Speckle
-leaves features uncertain by a pixel, so this only says where to look: the reference is warped into
-the image's frame, shifted to where the two correlate best, and the affine transform that
-maximizes their correlation
+Where every pixel of the image lies on the reference is predicted, and how far that can be off. The
+reference is drawn in the image's frame, as far as the prediction can err and some way beyond, and
+what is sought is a shift. Both are logarithms of amplitude, in which speckle is additive, less
+their surroundings. The shift is where they correlate best,
 
 .. math:: \rho = \frac{\sum (a - \bar a)(b - \bar b)}
-                       {\sqrt{\sum (a - \bar a)^2 \sum (b - \bar b)^2}}
+                       {\sqrt{\sum (a - \bar a)^2 \sum (b - \bar b)^2}}.
 
-is found by enhanced correlation coefficients [2]_, to a fraction of a pixel. Where all that two
-images share lies along a line (a causeway, a coast), nothing holds stretch and shear across it, and
-far from it they would move the image by pixels: shift and rotation alone are sought there.
+**Whether it is the place.** Correlation has maxima at wrong shifts, too. Tails of their heights
+fall off like those of a Gaussian field, so of the squares of wrong ones in falling order
+:math:`E_1 > E_2 > \dots` the spacings :math:`i (E_i - E_{i+1})` are independent and exponential
+with one mean [1]_. How much the first stands out of those after it has an F distribution, and the
+chance of a wrong one that stands out as much follows, for any number of shifts searched. Besides,
+the peak must be found again in several parts of the image, each by itself.
 
-Features agree by chance, too, and a straight shore correlates wherever it is moved along itself.
-What these do not do is correlate at one shift in every part of the image: the peak of correlation
-is found again without one block of the image at a time (jackknife), and its standard error says
-how well the image is held in place. Right matches have 0.1 to 1 pixel, wrong ones 5 and more.
+**How far it is off.** Near the peak shift, rotation and scale :math:`\theta` of the image about its
+center follow from the score of correlation, :math:`g = \tfrac12 \sum (a\,\partial b - b\,\partial
+a)`, and its information, :math:`H = \sum \partial a\,\partial b^T`: products of the two images, in
+which the speckle of neither adds to it. The score is a sum over cells that are larger than speckle,
+and what it varies by is told by the cells [2]_, each held against the others' estimate,
 
-Coordinates are (row, column), whole at the centers of pixels.
+.. math:: G = \sum_c \tilde g_c \tilde g_c^T, \quad
+          \tilde g_c = (1 - H_c H^{-1})^{-1} g_c, \qquad
+          \mathrm{cov}\,\theta = (H G^{-1} H + \Lambda)^{-1},
+
+where :math:`\Lambda` is what the prediction knows of rotation and scale. So these are free where
+the image tells more of them than the prediction does, and stay put where it does not: along a
+causeway nothing holds what is far from it but the prediction.
+
+Coordinates are (row, column), whole at the centers of pixels. Rotation is positive from columns to
+rows: by an angle :math:`\varphi`, (row, column) moves by :math:`(-\varphi\,column, \varphi\,row)`.
 
 References
 ----------
-.. [1] D. G. Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", International
-       Journal of Computer Vision 60(2), 2004.
-.. [2] G. D. Evangelidis, E. Z. Psarakis, "Parametric Image Alignment Using Enhanced Correlation
-       Coefficient Maximization", IEEE Trans. Pattern Analysis and Machine Intelligence 30(10),
-       2008.
+.. [1] A. Renyi, "On the theory of order statistics", Acta Mathematica Hungarica 4, 1953.
+.. [2] H. White, "A Heteroskedasticity-Consistent Covariance Matrix Estimator and a Direct Test for
+       Heteroskedasticity", Econometrica 48(4), 1980; the jackknife's form of it: J. G. MacKinnon,
+       H. White, Journal of Econometrics 29(3), 1985.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import binom
 
 from terrafix.models.core.arrays import FloatArray, Single
 
-KINDS = ("similarity", "affine")
-"""Transforms between an image and a reference."""
-
 REASONS = (
     "accepted",
-    "too few features are shared",
-    "features agree on no plausible transform",
     "it lies beyond the edge of the reference",
-    "correlation finds no peak where features put it",
+    "no place stands out of the others",
     "its parts do not agree on where it lies",
+    "too little in it holds it in place",
+    "it lies farther off than the prediction can be",
+    "what is estimated sees no ground",
+    "its place has no height",
 )
 """What became of an image."""
 
-_BLUR = 2.0
-"""Of the images in which features are sought [pixels]."""
-_SMOOTH = 1.0
-"""Of the images that are correlated [pixels]."""
-_BROAD = 10.0
-"""Of what is subtracted from them [pixels]."""
-_REACH = 8
-"""Largest shift that correlation looks for [pixels]."""
 _SMALLEST = 96
 """Rows and columns that an image must have."""
-_FEATURES = 4000
-_RATIO = 0.95
-"""Of the distances of the nearest and the second nearest feature, at most."""
-_THRESHOLD = 3.0
-"""How far off features may be [pixels]."""
-_TURN, _GROWTH = float(np.radians(30.0)), 1.5
-"""How much a feature may be turned and grown between the images."""
-_FEWEST = 7
-"""Features that must share a transform: fewer also share one by chance."""
-_NARROW = 0.1
-"""Share of the image's sides: tie points that scatter less along any direction are a line [-]. The
-standard deviation of what is spread evenly is 0.29 of a side."""
-_STRETCH = 1.08
-"""Largest stretch along any direction, either way: image and reference have like pixels."""
+_FINE, _COARSE, _BROAD = 1.0, 2.0, 10.0
+"""Blur of what is aligned, of what is searched, of what is subtracted from both [pixels]."""
+_LOOKS = 0.5
+"""Blur of power before its logarithm: speckle falls, and what is bright stays narrow [pixels]."""
+_DRAWN = 0.7
+"""Blur of a reference before it is drawn: detected speckle is finer than its pixels, and what is
+interpolated of it prefers some fractions of a pixel [pixels]."""
+_STEP = 2
+"""Pixels from one searched to the next, along each axis."""
+_SIGMAS = 3.0
+"""How far off the prediction may be [sigma]."""
+_MARGIN = 64
+"""Searched beyond that, to know how high wrong peaks are [pixels]."""
 _SEEN = 0.8
 """Share of the image that must lie on the reference."""
-_ROUNDS, _CLOSE = 30, 1e-4
+_LOBE = 6
+"""Half the side of a peak: no other is counted there [searched pixels]."""
+_SPACINGS = 16
+"""Peaks that the first one is held against."""
+_AMBIGUOUS = 1e-5
+"""Chance that the highest of wrong peaks stands out so much: at most."""
+_CHANCE = 1e-7
+"""Chance of that and of so many parts that agree with it: at most."""
+_CORNERS = 6.0
+"""Most that a turn or stretch moves the image's corners between those tried [pixels]."""
+_MOST = 41
+"""Turns, and stretches, tried."""
+_CELL = 24
+"""Side of cells whose speckle has nothing in common [pixels]."""
+_ROUNDS, _CLOSE, _STRIDE = 8, 0.01, 1.5
+"""Of the alignment, its end, and its longest step [pixels]."""
+_RIM = 3
+"""Of the image, where slopes are not known [pixels]."""
 _BLOCKS = 4
-"""Blocks along each axis that are left out in turn."""
-_SCATTER = 0.6
-"""Largest standard error of the peak [pixels]."""
-_MOVED = 4.0
-"""Largest move of the center by the alignment [pixels]."""
-_OFF = 0.5
-"""Largest distance of the peak of the blocks' correlation from the transform [pixels]."""
+"""Parts along each axis that must find the peak again."""
+_REACH = 8
+"""How far they look for it [pixels]."""
+_NEAR = 2.0
+"""How close they must come [pixels]."""
+_AGREE = 4
+"""How many must."""
+_BY_CHANCE = 0.1
+"""Share that does at wrong places: those within 2 pixels are 0.04 of those looked at, and a peak of
+the whole is where its parts are high. Measured at wrong places: 0.07."""
+_SCATTER = 0.5
+"""Largest standard error: three of them are the 1.5 pixels that a fix may be off."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where the pixels of an image lie on a reference, as an orbit predicts it.
+
+    Parameters
+    ----------
+    rows, columns : ndarray, shape (n_i,) and (n_j,)
+        Of the image's pixels whose places are given, increasing, at least two; between, places are
+        interpolated, and beyond they go on as between the last two.
+    places : ndarray, shape (n_i, n_j, 2)
+        Row and column of those on the reference.
+    covariance : ndarray, shape (2, 2)
+        Of the shift of the image, in its own rows and columns [pixels^2].
+    rotation_sigma : float
+        Of its turn about its center [rad].
+    scale_sigma : float
+        Of its growth [-].
+    """
+
+    rows: FloatArray
+    columns: FloatArray
+    places: FloatArray
+    covariance: FloatArray
+    rotation_sigma: float = 0.0
+    scale_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.places.shape != (len(self.rows), len(self.columns), 2):
+            raise ValueError(
+                f"places of {len(self.rows)} rows and {len(self.columns)} columns have shape "
+                f"{self.places.shape}"
+            )
+        values = (self.rows, self.columns, self.places, self.covariance)
+        if not all(np.isfinite(v).all() for v in values):
+            raise ValueError("what is predicted of an image is not finite everywhere")
+        if np.shape(self.covariance) != (2, 2) or np.linalg.eigvalsh(self.covariance)[0] < 0:
+            raise ValueError("the covariance of an image's shift is no covariance (2, 2)")
+
+    @staticmethod
+    def affine(
+        transform: ArrayLike,
+        covariance: ArrayLike,
+        rotation_sigma: float = 0.0,
+        scale_sigma: float = 0.0,
+    ) -> Prediction:
+        """Prediction by a transform (2, 3) of (row, column, 1) of the image to the reference."""
+        A, ends = np.asarray(transform, np.float64), np.array([0.0, 100.0])
+        i, j = np.meshgrid(ends, ends, indexing="ij")
+        places = np.stack([i, j, np.ones_like(i)], axis=-1) @ A.T
+        covariance = np.asarray(covariance, np.float64)
+        return Prediction(ends, ends, places, covariance, rotation_sigma, scale_sigma)
+
+    def at(self, rows: ArrayLike, columns: ArrayLike) -> FloatArray:
+        """Places on the reference, shape (n_rows, n_columns, 2), of rows and columns."""
+        one, other = (
+            _hats(np.asarray(x, np.float64), knots)
+            for x, knots in ((rows, self.rows), (columns, self.columns))
+        )
+        return np.stack([one @ self.places[..., k] @ other.T for k in (0, 1)], axis=-1)
+
+    def slope(self, row: float, column: float) -> FloatArray:
+        """Rows and columns of the reference by those of the image (2, 2), at a pixel of it."""
+        p = self.at([row - 0.5, row + 0.5], [column - 0.5, column + 0.5])
+        down = (p[1] - p[0]).mean(axis=0)
+        across = (p[:, 1] - p[:, 0]).mean(axis=0)
+        return np.stack([down, across], axis=1)
+
+
+def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
+    """Weights (n, n_knots) of linear interpolation."""
+    k = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 2)
+    u = (x - knots[k]) / (knots[k + 1] - knots[k])
+    weights = np.zeros((len(x), len(knots)))
+    i = np.arange(len(x))
+    weights[i, k], weights[i, k + 1] = 1 - u, u
+    return weights
+
+
+def _nowhere() -> FloatArray:
+    return np.full(2, np.nan)
 
 
 @dataclass(frozen=True)
@@ -99,39 +204,51 @@ class Match:
     ----------
     row, column : float
         Where the image's center lies on the reference [pixels]; NaN where nothing was found.
-    transform : ndarray, shape (2, 3)
-        From (row, column, 1) of the image to (row, column) of the reference.
-    n_inliers : int
-        Features that share the transform.
-    correlation : float
-        Of the whole image at the peak, -1 to 1.
-    sigma : ndarray, shape (2,)
-        Standard error of row and column that the parts of the image agree on [pixels].
+    covariance : ndarray, shape (2, 2)
+        Of row and column [pixels^2]; NaN where nothing was found.
     accepted : bool
     reason : str
         Why it was refused; ``"accepted"`` if it was not.
-    inliers : ndarray, shape (n, 4)
-        Row and column on the image and on the reference of the features that share it.
+    correlation : float
+        Of the whole image at the peak, -1 to 1.
+    chance : float
+        That the highest of wrong peaks stands out as much, and as many parts agree with it.
+    shift : ndarray, shape (2,)
+        Of the center from where it was predicted, in the image's rows and columns [pixels].
+    rotation, scale : float
+        Of the image about its center, from the prediction [rad] and [-].
+    outline : ndarray, shape (4, 2)
+        Corners of the image on the reference, first row first, then clockwise.
+    blocks : ndarray, shape (n, 4)
+        Middles of the parts of the image that agree: row and column on it, and on the reference.
     """
 
     row: float
     column: float
-    transform: FloatArray
-    n_inliers: int
-    correlation: float
-    sigma: FloatArray
+    covariance: FloatArray
     accepted: bool
     reason: str
-    inliers: FloatArray
+    correlation: float = 0.0
+    chance: float = 1.0
+    shift: FloatArray = field(default_factory=_nowhere)
+    rotation: float = 0.0
+    scale: float = 1.0
+    outline: FloatArray = field(default_factory=lambda: np.full((4, 2), np.nan))
+    blocks: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard errors of row and column (2,) [pixels]."""
+        return np.sqrt(np.diag(self.covariance))
 
 
 class Searchable:
-    """An amplitude image whose features are found once.
+    """An amplitude image.
 
     Parameters
     ----------
     amplitude : array_like, shape (n_rows, n_columns)
-        Not negative.
+        Not negative; zero where nothing was seen.
 
     Raises
     ------
@@ -146,236 +263,439 @@ class Searchable:
                 f"an image to be matched has {_SMALLEST} rows and columns at least, "
                 f"got shape {image.shape}"
             )
-        if not (np.isfinite(image).all() and (image >= 0).all()):
+        if not (np.isfinite(image).all() and image.min() >= 0):
             raise ValueError("an image to be matched must be finite and not negative")
         self.amplitude = image
 
-    @cached_property
-    def nepers(self) -> Single:
-        """Logarithm of amplitude; what is nearly black is lifted to a thousandth of the mean."""
-        floor = 1e-3 * max(float(self.amplitude.mean()), 1e-30)
-        return np.log(np.maximum(self.amplitude, np.float32(floor)))
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.amplitude.shape[0], self.amplitude.shape[1]
 
     @cached_property
-    def smooth(self) -> Single:
-        """What is correlated: details, without trends that correlate wherever they are moved."""
-        fine, broad = (cv2.GaussianBlur(self.nepers, (0, 0), s) for s in (_SMOOTH, _BROAD))
-        return np.asarray(fine - broad)
+    def layers(self) -> _Layers:
+        """What of it is searched and aligned."""
+        return _Layers(*_nepers(self.amplitude))
 
-    @cached_property
-    def features(self) -> tuple[FloatArray, Single]:
-        """Row, column, size, angle [rad] of features (n, 4), and what they look like (n, 128)."""
-        blurred = cv2.GaussianBlur(self.nepers, (0, 0), _BLUR)
-        low, high = np.percentile(blurred, [0.5, 99.5])
-        gray = np.clip((blurred - low) * (255 / max(float(high - low), 1e-6)), 0, 255)
-        opencv: Any = cv2  # its stubs lack some of what it has
-        sift = opencv.SIFT_create(nfeatures=_FEATURES, contrastThreshold=0.01)
-        points, descriptors = sift.detectAndCompute(gray.astype(np.uint8), None)
-        if descriptors is None:
-            return np.empty((0, 4)), np.empty((0, 128), np.float32)
-        found = [(p.pt[1], p.pt[0], p.size, np.radians(p.angle)) for p in points]
-        return np.array(found), descriptors
+
+class _Layers:
+    """Details of a logarithm of amplitude, without trends that correlate wherever they are moved.
+
+    What was not seen is zero in them, as is what does not differ from its surroundings.
+    """
+
+    def __init__(self, nepers: Single, seen: Single, blurred: float = 0.0) -> None:
+        self.seen, self._blurred = seen, blurred
+        broad = self._mean(nepers, _BROAD)
+        self.fine, self.coarse = (
+            np.asarray((self._mean(nepers, s) - broad) * seen, np.float32) for s in (_FINE, _COARSE)
+        )
+
+    def _mean(self, nepers: Single, blur: float) -> Single:
+        """Of what was seen about each pixel."""
+        blur = float(np.sqrt(blur**2 - self._blurred**2))
+        if self.seen.all():
+            return np.asarray(cv2.GaussianBlur(nepers, (0, 0), blur), np.float32)
+        weight = cv2.GaussianBlur(self.seen, (0, 0), blur)
+        total = cv2.GaussianBlur(nepers * self.seen, (0, 0), blur)
+        return np.asarray(total / np.maximum(weight, 1e-3), np.float32)
+
+
+def _nepers(amplitude: Single) -> tuple[Single, Single]:
+    """Logarithm of amplitude; nearly black is lifted to a thousandth of the mean. What was seen."""
+    seen = (amplitude > 0).astype(np.float32)
+    power = cv2.GaussianBlur(amplitude * amplitude, (0, 0), _LOOKS)
+    floor = 1e-6 * max(float(power.mean()), 1e-30)
+    return np.float32(0.5) * np.log(np.maximum(power, np.float32(floor))), seen
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """The reference in the frame of the image, from a row and a column of that on."""
+
+    layers: _Layers
+    first: FloatArray
+
+
+@dataclass(frozen=True)
+class _Peak:
+    """Of the search: shift (2,) of the image's middle, its turn, its growth, and what it is worth."""
+
+    shift: FloatArray
+    turn: float
+    growth: float
+    chance: float
+
+
+@dataclass(frozen=True)
+class _Aligned:
+    """Of the alignment: from the image to the drawn reference, and its covariance (4, 4)."""
+
+    transform: FloatArray
+    covariance: FloatArray
+    correlation: float
+    turn: float
+    growth: float
 
 
 def matched(
     image: Searchable,
     reference: Searchable,
+    predicted: Prediction,
     center: tuple[float, float] | None = None,
-    *,
-    kind: str = "similarity",
 ) -> Match:
     """Find where an image lies on a reference, or refuse to say.
 
     Parameters
     ----------
     image, reference : Searchable
+    predicted : Prediction
     center : tuple of float, optional
         Row and column of the image that is sought on the reference; its middle by default.
-    kind : {"similarity", "affine"}
-        Transform between them.
-
-    Raises
-    ------
-    ValueError
-        If `kind` is not a known choice.
     """
-    if kind not in KINDS:
-        raise ValueError(f"kind must be one of {KINDS}, got '{kind}'")
-    middle = tuple((n - 1) / 2 for n in image.amplitude.shape)
-    center = middle if center is None else center
-    transform, inliers = _shared_transform(image, reference, kind)
-    if transform is None:
-        return _refused("too few features are shared", inliers)
-    if not _plausible(transform):
-        return _refused("features agree on no plausible transform", inliers)
-    rigid = _is_line(inliers[:, :2], image.amplitude.shape)
-    if rigid:
-        transform = _rotation_and_shift(inliers)
-    warped, seen = _warped(reference, transform, image.amplitude.shape)
-    if seen < _SEEN:
-        return _refused("it lies beyond the edge of the reference", inliers)
-    shift, _ = _peak(_block_correlations(image.smooth, warped).sum(axis=0))
-    transform[:, 2] += transform[:, :2] @ shift
-    aligned, correlation = _aligned(image, reference, transform, rigid=rigid)
-    if aligned is None or not _plausible(aligned):
-        return _refused("correlation finds no peak where features put it", inliers)
-    moved = np.linalg.norm((aligned - transform) @ [*middle, 1.0])
-    warped, seen = _warped(reference, aligned, image.amplitude.shape)
-    shift, sigma = _held(_block_correlations(image.smooth, warped))
-    aligned[:, 2] += aligned[:, :2] @ shift
-    row, column = aligned @ [*center, 1.0]
+    middle = np.array([(n - 1) / 2 for n in image.shape])
+    c = middle if center is None else np.asarray(center, np.float64)
+    drawn = _drawn(image.shape, reference, predicted)
+    if drawn is None:
+        return refused("it lies beyond the edge of the reference")
+    peak = _searched(image, drawn, predicted)
+    if peak is None:
+        return refused("no place stands out of the others")
+    if peak.chance > _AMBIGUOUS:
+        return refused("no place stands out of the others", peak.chance)
+    aligned = _aligned(image, drawn, predicted, peak, c)
+    if aligned is None:
+        return refused("too little in it holds it in place", peak.chance)
+    return _judged(image, drawn, predicted, peak, aligned, c)
+
+
+def refused(reason: str, chance: float = 1.0) -> Match:
+    """No match, for one of `REASONS`."""
+    return Match(np.nan, np.nan, np.full((2, 2), np.nan), False, reason, chance=chance)
+
+
+def _judged(
+    image: Searchable,
+    drawn: _Drawn,
+    predicted: Prediction,
+    peak: _Peak,
+    aligned: _Aligned,
+    center: FloatArray,
+) -> Match:
+    """The match that an alignment is, accepted or not."""
+    W = aligned.transform
+    found = W @ [*center, 1.0] + drawn.first
+    shift = found - center
+    covariance = W[:, :2] @ aligned.covariance[:2, :2] @ W[:, :2].T
+    slope = predicted.slope(*found)
+    row, column = predicted.at(found[:1], found[1:])[0, 0]
+    agreeing = _agreeing(image, drawn, W)
+    chance = peak.chance * float(binom.sf(len(agreeing) - 1, _BLOCKS**2, _BY_CHANCE))
     reason = "accepted"
-    if seen < _SEEN:
-        reason = "it lies beyond the edge of the reference"
-    elif moved > _MOVED or np.abs(shift).max() > _OFF:
-        reason = "correlation finds no peak where features put it"
-    elif sigma.max() > _SCATTER:
+    if np.linalg.eigvalsh(covariance)[1] > _SCATTER**2:
+        reason = "too little in it holds it in place"
+    elif len(agreeing) < _AGREE or chance > _CHANCE:
         reason = "its parts do not agree on where it lies"
-    accepted = reason == "accepted"
+    elif _far(shift, predicted.covariance + covariance):
+        reason = "it lies farther off than the prediction can be"
+    n, m = image.shape
+    corners = np.array([[0, 0, 1], [0, m - 1, 1], [n - 1, m - 1, 1], [n - 1, 0, 1]])
+    parts = np.column_stack([agreeing, np.ones(len(agreeing))])
     return Match(
         float(row),
         float(column),
-        aligned,
-        len(inliers),
-        correlation,
-        sigma,
-        accepted,
+        slope @ covariance @ slope.T,
+        reason == "accepted",
         reason,
-        inliers,
+        aligned.correlation,
+        chance,
+        shift,
+        aligned.turn,
+        1 + aligned.growth,
+        _placed(predicted, corners @ W.T + drawn.first),
+        np.column_stack([agreeing, _placed(predicted, parts @ W.T + drawn.first)]),
     )
 
 
-def _refused(reason: str, inliers: FloatArray) -> Match:
-    nowhere, never = np.full((2, 3), np.nan), np.full(2, np.inf)
-    return Match(np.nan, np.nan, nowhere, len(inliers), 0.0, never, False, reason, inliers)
+def _placed(predicted: Prediction, pixels: FloatArray) -> FloatArray:
+    """Places on the reference (n, 2) of pixels (n, 2)."""
+    return np.reshape([predicted.at([i], [j])[0, 0] for i, j in pixels], (-1, 2))
 
 
-def _plausible(transform: FloatArray) -> bool:
-    """Whether a transform neither mirrors nor stretches beyond what a view can."""
-    linear = transform[:, :2]
-    stretch = np.linalg.svd(linear, compute_uv=False)
-    return bool(np.linalg.det(linear) > 0 and stretch[0] < _STRETCH and stretch[1] > 1 / _STRETCH)
+def _far(shift: FloatArray, covariance: FloatArray) -> bool:
+    """Whether a shift is larger than its covariance allows."""
+    covariance = covariance + 0.25 * np.eye(2)
+    return bool(shift @ np.linalg.solve(covariance, shift) > (_SIGMAS + 1) ** 2)
 
 
-def _is_line(points: FloatArray, shape: tuple[int, ...]) -> bool:
-    """Whether points (n, 2) of an image scatter too little along some direction."""
-    least = np.sqrt(max(float(np.linalg.eigvalsh(np.cov(points.T))[0]), 0.0))
-    return bool(least < _NARROW * min(shape))
+def searched_span(n: int, sigma: float) -> tuple[int, int]:
+    """Rows, or columns, that are searched about an image of `n` for a sigma of its shift."""
+    reach = int(np.ceil(_SIGMAS * sigma)) + _MARGIN
+    return -reach, n + reach
 
 
-def _rotation_and_shift(inliers: FloatArray) -> FloatArray:
-    """Transform (2, 3) without stretch and shear that fits features best (Kabsch)."""
-    here, there = inliers[:, :2], inliers[:, 2:]
-    middles = here.mean(axis=0), there.mean(axis=0)
-    left, _, right = np.linalg.svd((there - middles[1]).T @ (here - middles[0]))
-    turn = left @ np.diag([1.0, np.linalg.det(left @ right)]) @ right
-    return np.column_stack([turn, middles[1] - turn @ middles[0]])
+def _drawn(shape: tuple[int, int], reference: Searchable, predicted: Prediction) -> _Drawn | None:
+    """The reference in the frame of the image, as far as it may be shifted and is there."""
+    sigmas = np.sqrt(np.diag(predicted.covariance))
+    spans = [searched_span(n, float(s)) for n, s in zip(shape, sigmas, strict=True)]
+    axes = [np.arange(low, high + 8, 8.0) for low, high in spans]
+    inside = _inside(predicted.at(*axes), reference.shape)
+    if not inside.any():
+        return None
+    for k, n in enumerate(shape):
+        there = axes[k][inside.any(axis=1 - k)]
+        spare = int((1 - _SEEN) * n)
+        low, high = int(there[0]) - 8 - spare, int(there[-1]) + 8 + spare
+        spans[k] = max(spans[k][0], low), min(spans[k][1], high)
+        if spans[k][1] - spans[k][0] < n:
+            return None
+    place = predicted.at(*(np.arange(*s) for s in spans)).astype(np.float32)
+    seen = _inside(place, reference.shape)
+    if not seen.any():
+        return None
+    low = np.floor(place[seen].min(axis=0)).astype(int) - 2
+    high = np.ceil(place[seen].max(axis=0)).astype(int) + 3
+    low = np.maximum(low, 0)
+    part = _averaged(reference.amplitude[low[0] : high[0], low[1] : high[1]], predicted, shape)
+    nepers, known = _nepers(part)
+    x, y = (np.ascontiguousarray(place[..., k] - low[k], np.float32) for k in (1, 0))
+    smooth = cv2.GaussianBlur(nepers, (0, 0), _DRAWN)
+    there = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if not known.all():
+        seen &= cv2.remap(known, x, y, cv2.INTER_LINEAR) > 0.5
+    layers = _Layers(np.asarray(there), seen.astype(np.float32), _DRAWN)
+    return _Drawn(layers, np.array([float(s[0]) for s in spans]))
 
 
-def _shared_transform(
-    image: Searchable, reference: Searchable, kind: str
-) -> tuple[FloatArray | None, FloatArray]:
-    """Transform that most features share, in (row, column), and the features that do."""
-    (here, look), (there, like) = image.features, reference.features
-    least = 3 if kind == "affine" else 2
-    none = np.empty((0, 4))
-    if len(here) < least or len(there) < 2:
-        return None, none
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(look, like, k=2)
-    good = [a for a, b in pairs if a.distance < _RATIO * b.distance]
-    one, other = (
-        x[[getattr(m, k) for m in good]] for x, k in ((here, "queryIdx"), (there, "trainIdx"))
+def _inside(place: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which places (..., 2) are on an image of a shape."""
+    return np.all((place >= 0) & (place <= np.array(shape) - 1), axis=-1)
+
+
+def _averaged(amplitude: Single, predicted: Prediction, shape: tuple[int, int]) -> Single:
+    """Amplitude of a reference, blurred to pixels of the image where its own are smaller."""
+    slope = predicted.slope(*((n - 1) / 2 for n in shape))
+    sizes = np.linalg.norm(slope, axis=1)
+    if sizes.max() < 1.5:
+        return amplitude
+    blur = 0.5 * np.sqrt(np.maximum(sizes**2 - 1, 1e-4))
+    power = cv2.GaussianBlur(amplitude**2, (0, 0), sigmaX=blur[1], sigmaY=blur[0])
+    return np.asarray(np.sqrt(power), np.float32)
+
+
+def _tried(sigma: float, corner: float) -> FloatArray:
+    """Turns, or growths, that are tried where corners so far off would be moved too much."""
+    n = min(int(np.ceil(_SIGMAS * sigma * corner / _CORNERS - 0.5)), _MOST // 2)
+    return np.arange(-max(n, 0), max(n, 0) + 1) * (_CORNERS / corner)
+
+
+def _linear(turn: float, growth: float) -> FloatArray:
+    """Turn and growth of (row, column), shape (2, 2)."""
+    c, s = np.cos(turn), np.sin(turn)
+    return (1 + growth) * np.array([[c, -s], [s, c]])
+
+
+def _xy(transform: FloatArray) -> FloatArray:
+    """A transform (2, 3) of (row, column), of (x, y)."""
+    return np.ascontiguousarray(transform[::-1][:, [1, 0, 2]])
+
+
+def _searched(image: Searchable, drawn: _Drawn, predicted: Prediction) -> _Peak | None:
+    """Shift at which the image correlates best, among those that the prediction allows."""
+    a = np.ascontiguousarray(image.layers.coarse[::_STEP, ::_STEP])
+    b = np.ascontiguousarray(drawn.layers.coarse[::_STEP, ::_STEP])
+    if a.std() < 1e-6 or b.shape[0] < a.shape[0] or b.shape[1] < a.shape[1]:
+        return None
+    seen = cv2.matchTemplate(
+        np.ascontiguousarray(drawn.layers.seen[::_STEP, ::_STEP]),
+        np.full(a.shape, 1 / a.size, np.float32),
+        cv2.TM_CCORR,
     )
-    turn = np.angle(np.exp(1j * (other[:, 3] - one[:, 3])))
-    growth = np.abs(np.log(other[:, 2] / one[:, 2]))
-    alike = (np.abs(turn) < _TURN) & (growth < np.log(_GROWTH))
-    places = np.hstack([one[alike, :2], other[alike, :2]])
-    if len(places) < least:
-        return None, none
-    cv2.setRNGSeed(0)
-    estimate: Any = cv2.estimateAffine2D if kind == "affine" else cv2.estimateAffinePartial2D
-    found, kept = estimate(
-        places[:, 1::-1],
-        places[:, :1:-1],
-        method=cv2.RANSAC,
-        ransacReprojThreshold=_THRESHOLD,
-        maxIters=5000,
-        confidence=0.999,
-    )
-    if found is None or int(kept.sum()) < _FEWEST:
-        return None, none
-    swapped = found[::-1][:, [1, 0, 2]]  # from (x, y) to (row, column)
-    return np.ascontiguousarray(swapped), places[kept.ravel() > 0]
-
-
-def _warped(
-    reference: Searchable, transform: FloatArray, shape: tuple[int, int]
-) -> tuple[Single, float]:
-    """Reference in the frame of the image, and the share of the image that it covers."""
-    xy = np.ascontiguousarray(transform[::-1][:, [1, 0, 2]])
-    size = (shape[1], shape[0])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpAffine(
-        reference.smooth, xy, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
-    )
-    inside = cv2.warpAffine(np.ones_like(reference.smooth), xy, size, flags=flags)
-    return np.asarray(warped), float(inside.mean())
-
-
-def _aligned(
-    image: Searchable, reference: Searchable, transform: FloatArray, *, rigid: bool
-) -> tuple[FloatArray | None, float]:
-    """Transform near a given one that maximizes correlation, and the correlation."""
-    xy = np.ascontiguousarray(transform[::-1][:, [1, 0, 2]], np.float32)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ROUNDS, _CLOSE)
-    try:
-        opencv: Any = cv2
-        motion = cv2.MOTION_EUCLIDEAN if rigid else cv2.MOTION_AFFINE
-        correlation, found = opencv.findTransformECC(
-            image.smooth, reference.smooth, xy, motion, criteria, None, 1
-        )
-    except cv2.error:  # it raises where the images do not overlap or do not correlate
-        return None, 0.0
-    if not np.isfinite(found).all():
-        return None, 0.0
-    return np.ascontiguousarray(found[::-1][:, [1, 0, 2]], np.float64), float(correlation)
-
-
-def _block_correlations(image: Single, warped: Single) -> FloatArray:
-    """Correlation of every block with the warped reference, at shifts up to `_REACH` either way.
-
-    Shape (n_blocks, 2 * _REACH + 1, 2 * _REACH + 1), not normalized: their sum is the whole's.
-    """
-    surfaces = []
-    for a, b in zip(_blocks(image), _blocks(warped), strict=True):
-        inner = np.ascontiguousarray(a[_REACH:-_REACH, _REACH:-_REACH])
-        surfaces.append(cv2.matchTemplate(b, inner, cv2.TM_CCOEFF))
-    return np.array(surfaces, np.float64)
-
-
-def _blocks(image: Single) -> list[Single]:
-    return [
-        np.ascontiguousarray(block)
-        for band in np.array_split(image, _BLOCKS, 0)
-        for block in np.array_split(band, _BLOCKS, 1)
+    corner = float(np.hypot(*image.shape)) / 2
+    best = np.full(seen.shape, -np.inf, np.float32)
+    tried = [
+        (turn, growth)
+        for turn in _tried(predicted.rotation_sigma, corner)
+        for growth in _tried(predicted.scale_sigma, corner)
     ]
+    which = np.zeros(seen.shape, np.int32)
+    for k, (turn, growth) in enumerate(tried):
+        surface = cv2.matchTemplate(b, _turned(a, turn, growth), cv2.TM_CCOEFF_NORMED)
+        higher = surface > best
+        best[higher], which[higher] = surface[higher], k
+    best[(seen < _SEEN) | ~np.isfinite(best)] = 0.0
+    shifts = [np.arange(n) * float(_STEP) + f for n, f in zip(best.shape, drawn.first, strict=True)]
+    found = _standing_out(best, _allowed(shifts, predicted.covariance))
+    if found is None:
+        return None
+    i, j, chance = found
+    at = _vertex(best, i, j) * _STEP + drawn.first
+    return _Peak(at, *tried[which[i, j]], chance)
 
 
-def _peak(surface: FloatArray) -> tuple[FloatArray, float]:
-    """Shift (2,) at the peak of correlation, by parabolas through it, and its height."""
-    i, j = (int(k) for k in np.unravel_index(surface.argmax(), surface.shape))
+def _turned(a: Single, turn: float, growth: float) -> Single:
+    """An image turned and grown about its middle."""
+    if turn == 0 and growth == 0:
+        return a
+    middle = np.array([(n - 1) / 2 for n in a.shape])
+    back = np.linalg.inv(_linear(turn, growth))
+    transform = np.column_stack([back, middle - back @ middle])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(a, _xy(transform), a.shape[::-1], flags=flags))
+
+
+def _allowed(shifts: list[FloatArray], covariance: FloatArray) -> NDArray[np.bool_]:
+    """Which shifts the prediction allows, and those a peak's width beyond."""
+    grown = covariance + (_STEP * _LOBE / _SIGMAS) ** 2 * np.eye(2)
+    i, j = np.meshgrid(*shifts, indexing="ij")
+    one = np.linalg.inv(grown)
+    square = one[0, 0] * i * i + 2 * one[0, 1] * i * j + one[1, 1] * j * j
+    return np.asarray(square <= _SIGMAS**2)
+
+
+def _standing_out(
+    surface: Single, allowed: NDArray[np.bool_]
+) -> tuple[int, int, float] | None:
+    """The highest allowed peak, and the chance that a wrong one stands out as much."""
+    where = np.where(allowed, surface, -np.inf)
+    i, j = (int(k) for k in np.unravel_index(where.argmax(), where.shape))
+    if not (0 < i < surface.shape[0] - 1 and 0 < j < surface.shape[1] - 1) or where[i, j] <= 0:
+        return None
+    side = np.ones((2 * _LOBE + 1, 2 * _LOBE + 1), np.uint8)
+    highest = (surface >= cv2.dilate(surface, side)) & (surface > 0)
+    highest[max(i - _LOBE, 0) : i + _LOBE + 1, max(j - _LOBE, 0) : j + _LOBE + 1] = False
+    tops = surface[highest]
+    E = np.sort(tops)[::-1][: _SPACINGS + 1].astype(np.float64) ** 2
+    if len(E) < 3:
+        return None
+    n = len(E) - 1
+    mean = float(np.mean(np.arange(2, n + 2) * -np.diff(E)))
+    ahead = (float(surface[i, j]) ** 2 - E[0]) / max(mean, 1e-12)
+    return i, j, float((1 + max(ahead, 0.0) / n) ** -n)
+
+
+def _vertex(surface: Single, i: int, j: int) -> FloatArray:
+    """Row and column (2,) of a peak, by parabolas through it."""
     peak = np.array([i, j], np.float64)
     for axis, (k, line) in enumerate(((i, surface[:, j]), (j, surface[i, :]))):
         if 0 < k < len(line) - 1:
-            curvature = line[k - 1] - 2 * line[k] + line[k + 1]
+            curvature = float(line[k - 1]) - 2 * float(line[k]) + float(line[k + 1])
             if curvature < 0:
-                peak[axis] += (line[k - 1] - line[k + 1]) / (2 * curvature)
-    return peak - _REACH, float(surface[i, j])
+                peak[axis] += (float(line[k - 1]) - float(line[k + 1])) / (2 * curvature)
+    return peak
 
 
-def _held(surfaces: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Shift (2,) that all blocks agree on, and its jackknife standard error (2,)."""
-    total, n = surfaces.sum(axis=0), len(surfaces)
-    without = np.array([_peak(total - s)[0] for s in surfaces])
-    spread = np.sum((without - without.mean(axis=0)) ** 2, axis=0)
-    return _peak(total)[0], np.sqrt((n - 1) / n * spread)
+def _aligned(
+    image: Searchable, drawn: _Drawn, predicted: Prediction, peak: _Peak, center: FloatArray
+) -> _Aligned | None:
+    """Shift, turn and growth about the center that maximize correlation, from the peak on."""
+    middle = np.array([(n - 1) / 2 for n in image.shape])
+    A = _linear(peak.turn, peak.growth)
+    start = middle + peak.shift - drawn.first
+    transform = np.column_stack([A, start - A @ middle])
+    unit = float(np.hypot(*image.shape)) / 4
+    sigmas = np.maximum([predicted.rotation_sigma, predicted.scale_sigma], 1e-7) * unit
+    known = np.diag([0.0, 0.0, *(sigmas**-2.0)])
+    off = np.array([0.0, 0.0, peak.turn, peak.growth]) * [1, 1, unit, unit]
+    levels = ("coarse", "fine") if np.any(off) else ("fine",)
+    for level in levels:
+        a, b = getattr(image.layers, level), getattr(drawn.layers, level)
+        patch = _Patch(a, center, unit)
+        for _ in range(_ROUNDS):
+            score, H, G = patch.held_against(_warped(b, transform, a.shape))
+            if np.linalg.eigvalsh(H[:2, :2])[0] <= 0:
+                return None
+            weight = H @ np.linalg.inv(G)
+            covariance = np.linalg.inv(weight @ H + known)
+            step = covariance @ (weight @ score - known @ off)
+            if not np.isfinite(step).all():
+                return None
+            step *= min(1.0, _STRIDE / max(float(np.abs(step).max()), 1e-9))
+            off = off + step * [0, 0, 1, 1]
+            transform = _moved(transform, step / [1, 1, unit, unit], center)
+            if np.abs(step).max() < _CLOSE:
+                break
+    if np.abs(step).max() > 10 * _CLOSE:
+        return None
+    warped = _warped(b, transform, a.shape)
+    correlation = float(np.corrcoef(a.ravel(), warped.ravel())[0, 1])
+    return _Aligned(transform, covariance, correlation, off[2] / unit, off[3] / unit)
+
+
+def _moved(transform: FloatArray, step: FloatArray, center: FloatArray) -> FloatArray:
+    """A transform (2, 3) of an image that is first shifted, turned and grown about its center."""
+    A = _linear(step[2], step[3])
+    t = center + step[:2] - A @ center
+    return np.column_stack([transform[:, :2] @ A, transform[:, :2] @ t + transform[:, 2]])
+
+
+def _warped(b: Single, transform: FloatArray, shape: tuple[int, ...], rim: int = 0) -> Single:
+    """A drawn reference where an image is on it, and some pixels about."""
+    transform = transform.copy()
+    transform[:, 2] -= transform[:, :2] @ [rim, rim]
+    size = (shape[1] + 2 * rim, shape[0] + 2 * rim)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(b, _xy(transform), size, flags=flags))
+
+
+class _Patch:
+    """An image whose correlation with another is a function of shift, turn and growth.
+
+    Turn and growth are counted in pixels of those `unit` away from the center.
+    """
+
+    def __init__(self, a: Single, center: FloatArray, unit: float) -> None:
+        inner = (slice(_RIM, -_RIM),) * 2
+        self._inner = inner
+        y, x = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in a.shape), indexing="ij")
+        self._y = (y[inner] - np.float32(center[0])) / np.float32(unit)
+        self._x = (x[inner] - np.float32(center[1])) / np.float32(unit)
+        self._a, self._slopes = self._normalized(a)
+
+    def _normalized(self, a: Single) -> tuple[Single, Single]:
+        """An image and its slopes along the parameters (4, ...), of unit power."""
+        down, across = (g[self._inner] for g in np.gradient(a))
+        inner = a[self._inner]
+        y, x = self._y, self._x
+        slopes = np.stack([down, across, y * across - x * down, y * down + x * across])
+        scale = 1 / np.sqrt(max(float(np.mean(inner * inner)), 1e-12))
+        return inner * np.float32(scale), slopes * np.float32(scale)
+
+    def held_against(self, b: Single) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Score (4,) of correlation, its information and its covariance (4, 4) each."""
+        other, slopes = self._normalized(b)
+        g = _cells(self._a * slopes - other * self._slopes) / 2
+        one = np.stack([_cells(s * slopes) for s in self._slopes])
+        H = (one + one.swapaxes(0, 1)) / 2
+        score, total = g.sum(axis=-1), H.sum(axis=-1)
+        floor = 1e-9 * np.trace(total) * np.eye(4)
+        share = np.einsum("ijn,jk->nik", H, np.linalg.pinv(total))
+        share *= np.minimum(1, 0.9 / np.maximum(np.linalg.norm(share, axis=(1, 2)), 1e-9))[
+            :, None, None
+        ]
+        alone = np.linalg.solve(np.eye(4) - share, g.T[..., None])[..., 0]
+        return score, total, alone.T @ alone + floor
+
+
+def _cells(x: Single) -> FloatArray:
+    """Sums over cells, shape (..., n_cells), of what is of shape (..., n_rows, n_columns)."""
+    n, m = x.shape[-2:]
+    rows, columns = (np.arange(0, max(k - _CELL // 2, 1), _CELL) for k in (n, m))
+    sums = np.add.reduceat(np.add.reduceat(x, rows, axis=-2), columns, axis=-1)
+    return sums.reshape(*x.shape[:-2], -1).astype(np.float64)
+
+
+def _agreeing(image: Searchable, drawn: _Drawn, transform: FloatArray) -> FloatArray:
+    """Middles (n, 2) of the parts of an image that find the common peak by themselves."""
+    wide = _warped(drawn.layers.fine, transform, image.shape, _REACH)
+    found = []
+    for rows in np.array_split(np.arange(image.shape[0]), _BLOCKS):
+        for columns in np.array_split(np.arange(image.shape[1]), _BLOCKS):
+            i, j, n, m = rows[0], columns[0], len(rows), len(columns)
+            part = np.ascontiguousarray(image.layers.fine[i : i + n, j : j + m])
+            about = np.ascontiguousarray(wide[i : i + n + 2 * _REACH, j : j + m + 2 * _REACH])
+            surface = cv2.matchTemplate(about, part, cv2.TM_CCOEFF)
+            p, q = (int(k) for k in np.unravel_index(surface.argmax(), surface.shape))
+            if np.hypot(*(_vertex(surface, p, q) - _REACH)) < _NEAR:
+                found.append([i + (n - 1) / 2, j + (m - 1) / 2])
+    return np.reshape(found, (-1, 2))

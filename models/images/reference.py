@@ -7,12 +7,14 @@ the slant geometry of an earlier pass and a map serve alike.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafix.models.core.arrays import FloatArray, Single, read_arrays
+from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.geodesy import geodetic
 from terrafix.models.geometry.geolocation import Height, ground_point_on_terrain
 from terrafix.models.geometry.ground import Ground, seen_on_terrain
@@ -24,7 +26,12 @@ from terrafix.models.radar.multilook import detected, full_index, multilook_inde
 from terrafix.models.radar.scene import Scene
 
 _ROUNDS, _CLOSE = 20, 1e-3
-"""Of the search for a place's pixel, and how close it comes [pixels]."""
+"""Of the search for a place's pixel, and how close it comes [pixels]; of heights [m]."""
+_ROUNDS_OF_HEIGHT = 60
+_FEWEST_TIES, _MOST_TIES = 8, 65
+"""Tie points along each axis through which the polynomial of heights is put, at least and most."""
+_NO_POLYNOMIAL = 0.5
+"""Distance of a tie point from it beyond which it is not used [m]."""
 
 KEYS = ("amplitude", "rows", "columns", "latitude_deg", "longitude_deg", "height_m")
 _TURN = 2 * np.pi
@@ -112,10 +119,71 @@ class Reference:
             interpolated(self.height),
         )
 
+    def place_on(self, terrain: Height, row: float, column: float) -> tuple[float, float, float]:
+        """Latitude, longitude [rad] and height [m] of a pixel on a terrain.
+
+        Between tie points relief bends an image in slant geometry more than a line between them
+        tells: by meters where they are 60 m apart. What a pixel sees at one height is smooth, so
+        its place is taken as a polynomial of row, column and height through all tie points, and
+        the height as that of the terrain there. Where tie points are no such polynomial (within
+        0.5 m), or heights do not settle (layover), it is that of `place`.
+
+        Parameters
+        ----------
+        terrain : callable
+            Height [m] at latitudes and longitudes [rad].
+        row, column : float
+            Fractional.
+
+        Raises
+        ------
+        ValueError
+            If the pixel is outside the tie points.
+        """
+        latitude, longitude, height = (float(x) for x in self.place(row, column))
+        coefficients = self._by_height
+        if coefficients is not None:
+            h = height
+            for _ in range(_ROUNDS_OF_HEIGHT):
+                terms = self._terms(np.array(row), np.array(column), np.array(h))
+                found = terms @ coefficients
+                rise = float(terrain(found[0], found[1])) - h
+                if abs(rise) < _CLOSE:
+                    return float(found[0]), float(found[1]), h
+                h += 0.7 * rise
+        return latitude, longitude, float(terrain(np.array(latitude), np.array(longitude)))
+
+    def _terms(self, row: FloatArray, column: FloatArray, height: FloatArray) -> FloatArray:
+        """Terms (..., 15) of the polynomial of row, column and height, in ranges about one."""
+        (i0, i1), (j0, j1) = self.rows[[0, -1]], self.columns[[0, -1]]
+        i, j = (2 * row - i0 - i1) / (i1 - i0), (2 * column - j0 - j1) / (j1 - j0)
+        h = (height - self.height.mean()) / 1000.0
+        one = np.ones(np.broadcast_shapes(i.shape, j.shape, h.shape))
+        plane = [i**a * j**b for a in range(4) for b in range(4 - a)]
+        return np.stack([one * x for x in (*plane, h, h * i, h * j, h * h, h * j * j)], axis=-1)
+
+    @cached_property
+    def _by_height(self) -> FloatArray | None:
+        """Coefficients (15, 2) of latitude and longitude; None where tie points differ from it."""
+        if min(self.height.shape) < _FEWEST_TIES:
+            return None
+        own = [np.unique(np.linspace(0, n - 1, _MOST_TIES).astype(int)) for n in self.height.shape]
+        at = np.ix_(*own)
+        row, column = self.rows[own[0]][:, None], self.columns[own[1]][None, :]
+        terms = self._terms(row, column, self.height[at])
+        terms = terms.reshape(-1, terms.shape[-1])
+        known = np.stack([self.latitude[at].ravel(), self.longitude[at].ravel()], axis=-1)
+        coefficients = np.linalg.lstsq(terms, known, rcond=None)[0]
+        miss = EARTH.radius * np.abs(terms @ coefficients - known)
+        miss[:, 1] *= np.cos(known[:, 0])
+        return coefficients if miss.max() < _NO_POLYNOMIAL else None
+
     def pixel(
-        self, latitude: ArrayLike, longitude: ArrayLike
+        self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike | None = None
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Row and column, fractional, of places [rad], and whether they are inside: of `place`.
+        """Row and column, fractional, of places [rad], and whether they are inside.
+
+        Of `place`; of places whose height is given, as `place_on` finds them.
 
         Solved by Newton's method with the mean slope of the tie points, which relief bends by less
         than a half; where it does not settle (layover), a place counts as outside.
@@ -123,7 +191,10 @@ class Reference:
         Parameters
         ----------
         latitude, longitude : array_like, shape (...)
+        height : array_like, shape (...), optional
+            Of the places [m].
         """
+        coefficients = None if height is None else self._by_height
         wanted = np.stack([np.asarray(latitude), self.own_turn(longitude)], axis=-1)
         i, j = np.meshgrid(self.rows, self.columns, indexing="ij")
         ties = np.stack([np.ones_like(i), i, j], axis=-1).reshape(-1, 3)
@@ -136,7 +207,11 @@ class Reference:
         high = np.array([self.rows[-1], self.columns[-1]])
         for _ in range(_ROUNDS):
             held = np.clip(pixel, low, high)
-            found = np.stack(self.place(held[..., 0], held[..., 1])[:2], axis=-1)
+            if coefficients is None:
+                found = np.stack(self.place(held[..., 0], held[..., 1])[:2], axis=-1)
+            else:
+                terms = self._terms(held[..., 0], held[..., 1], np.asarray(height, np.float64))
+                found = terms @ coefficients
             change = (wanted - found) @ inverse
             pixel = held + change
             inside = np.all((pixel >= low) & (pixel <= high), axis=-1)
@@ -179,7 +254,12 @@ def _between(x: ArrayLike, knots: FloatArray, what: str) -> tuple[np.ndarray, Fl
 
 
 def geocoded(
-    image: Image, arc: Arc, terrain: Height, looks: tuple[int, int], n_ties: int = 33
+    image: Image,
+    arc: Arc,
+    terrain: Height,
+    looks: tuple[int, int],
+    n_ties: int = 33,
+    side: int = 1,
 ) -> Reference:
     """Reference from a focused image whose orbit is known.
 
@@ -194,6 +274,8 @@ def geocoded(
         Pixels averaged in azimuth and range.
     n_ties : int
         Tie points along each axis.
+    side : {1, -1}
+        To the right of the track, or to the left.
     """
     amplitude = detected(image.valid, looks)
     ties = [np.linspace(0, n - 1, n_ties) for n in amplitude.shape]
@@ -204,7 +286,7 @@ def geocoded(
     t, R = image.seen_at(row[:, None], column[None, :], image.doppler)
     r, v = arc.position(t), arc.velocity(t)
     sine = image.radar.wavelength * image.doppler / (2 * np.linalg.norm(v, axis=-1))
-    p = ground_point_on_terrain(r, v, R, sine, terrain)
+    p = ground_point_on_terrain(r, v, R, sine, terrain, side=side)
     return Reference(amplitude, ties[0], ties[1], *geodetic(p))
 
 

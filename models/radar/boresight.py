@@ -14,6 +14,8 @@ from terrafix.models.geometry.geodesy import ellipsoid_intersection, geodetic
 from terrafix.models.maps.dem import Dem
 
 _ROUNDS = 50
+_ACROSS = float(np.sin(np.radians(2.0)))
+"""Sine of the least angle between a boresight and the vertical plane of the track."""
 
 
 def _above(r_e: object, direction: object, height: object) -> object:
@@ -38,11 +40,14 @@ class Boresight:
         Distance to it [m].
     closing : float
         Speed toward it [m/s].
+    side : {1, -1}
+        To the right of the track, or to the left.
     """
 
     point: FloatArray
     slant_range: float
     closing: float
+    side: int = 1
 
     def doppler(self, wavelength: float) -> float:
         """Doppler frequency with which it is seen [Hz], positive when closing."""
@@ -74,10 +79,9 @@ def boresight_on_terrain(
     Raises
     ------
     ValueError
-        If the boresight misses the Earth or looks to the left, or the terrain is not known where
-        it meets it.
+        If the boresight misses the Earth or lies along the track, or the terrain is not known
+        where it meets it.
     """
-    right = np.cross(v_e, r_e)
     direction = boresight_direction_array(q_be, nominal_antenna_array(look, squint), q_mu)
     height = 0.0
     for _ in range(_ROUNDS):
@@ -90,10 +94,14 @@ def boresight_on_terrain(
             break
         height += 0.7 * rise
     line = point - r_e
-    if not line @ right > 0:
-        raise ValueError(
-            "it looks to the left of the track, and images are of the right alone\n"
-            "  set a positive look angle"
-        )
     distance = float(np.linalg.norm(line))
-    return Boresight(point, distance, float(v_e @ line) / distance)
+    right = np.cross(v_e, r_e)
+    across = float(line @ right) / float(np.linalg.norm(right)) / distance
+    if abs(across) < _ACROSS:
+        raise ValueError(
+            f"it lies {np.degrees(abs(across)):.2f} deg off the track, ahead of it or below: what "
+            "is to its right and to its left has the same ranges\n"
+            "  set a look angle, positive to the right or negative to the left"
+        )
+    side = 1 if across > 0 else -1
+    return Boresight(point, distance, float(v_e @ line) / distance, side)

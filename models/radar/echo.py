@@ -69,6 +69,8 @@ class Acquisition:
         Along the track [m].
     illuminated : float
         Doppler bandwidth that is illuminated [Hz], at most the repetition frequency.
+    side : {1, -1}
+        To the right of the track, or to the left.
 
     Raises
     ------
@@ -84,6 +86,7 @@ class Acquisition:
     centroid: float = 0.0
     antenna_length: float = 8.9
     illuminated: float = 0.0
+    side: int = 1
 
     def __post_init__(self) -> None:
         if self.n_lines < 2 or self.n_cells < self.radar.n_pulse:
@@ -199,6 +202,7 @@ def illuminated_footprint(arc: Arc, acquisition: Acquisition) -> tuple[Footprint
         acquisition.near_range,
         acquisition.n_cells,
         acquisition.centroid,
+        side=acquisition.side,
     )
     aperture = acquisition.illuminated / _doppler_rate(at)
     before = int(np.ceil(aperture / 2 * radar.prf)) + 16
@@ -206,7 +210,8 @@ def illuminated_footprint(arc: Arc, acquisition: Acquisition) -> tuple[Footprint
     shift = acquisition.near_range - (radar.n_pulse + 16) * radar.range_spacing
     n_cells = int(fft.next_fast_len(acquisition.n_cells + radar.n_pulse + 32))
     first = acquisition.first_time - before / radar.prf
-    whole = Footprint(arc, radar, first, n_lines, shift, n_cells, acquisition.centroid)
+    centroid, side = acquisition.centroid, acquisition.side
+    whole = Footprint(arc, radar, first, n_lines, shift, n_cells, centroid, side=side)
     return whole, before
 
 

@@ -28,6 +28,8 @@ _HIGHEST = 5000.0
 """Relief about the middle that is allowed for from orbit [m]."""
 _SPARE = 20.0
 """Relief that is allowed for beyond what a coarse look finds [m]."""
+_WIDEST = float(np.radians(90.0))
+"""Longitudes that a footprint may span: beyond, polynomials of them fail [rad]."""
 _EARTH = EllipsoidGround()
 _ROUNDS = 40
 """Rounds of looking up; layover, where the height has several values, ends without agreement."""
@@ -192,6 +194,12 @@ class _Surface:
         latitude, longitude, _ = ground.geodetic(p)
         center = float(longitude.flat[0])
         longitude = center + np.angle(np.exp(1j * (longitude - center)))
+        if np.ptp(longitude) > _WIDEST:
+            raise ValueError(
+                f"its footprint lies about a pole: its longitudes span "
+                f"{np.degrees(np.ptp(longitude)):.0f} deg, and terrain is a grid of latitude and "
+                "longitude\n  fly farther from the pole, or receive fewer lines and cells"
+            )
         self.coefficients = [_chebyshev3(a) for a in (latitude, longitude)]
 
     def on(self, t: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -135,6 +135,7 @@ INERTIAL = {
 SETTINGS = {
     "atmosphere": {"f107": 140.0, "f107a": 130.0, "ap": 12.0},
     "antenna_mount": {"misalignment_sigma0": 1e-3, "misalignment_walk": 1e-4},
+    "antenna_steering": {"looks": "34.3 deg"},
     "attitude_sensor": {"noise_sigma": 1e-4, "bias_sigma": 1e-3},
     "flight": {
         "turbulence": "dryden",

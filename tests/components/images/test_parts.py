@@ -12,6 +12,7 @@ from terrafix.components.images.reference import EarlierPass, RenderedReference
 from terrafix.components.sensors import echo
 from terrafix.components.sensors.echo import SceneEcho
 from terrafix.components.shared import generator
+from terrafix.cosim.basics.errors import ConfigurationError
 from terrafix.cosim.declare.component import Environment
 from terrafix.models.geometry.earth import EARTH
 from terrafix.models.geometry.geolocation import ground_point
@@ -123,9 +124,9 @@ def test_the_earlier_pass_flew_where_it_is_said_to(monkeypatch):
     class SeenError(Exception):
         pass
 
-    def footprint(arc, radar, first_time, n_lines, near_range, n_cells, centroid):
+    def footprint(arc, radar, first_time, n_lines, near_range, n_cells, centroid, side):
         made.update(arc=arc, middle=near_range + (n_cells - 1) / 2 * radar.range_spacing)
-        made.update(time=first_time + (n_lines - 1) / 2 / radar.prf)
+        made.update(time=first_time + (n_lines - 1) / 2 / radar.prf, side=side)
         raise SeenError
 
     monkeypatch.setattr(reference, "Footprint", footprint)
@@ -145,6 +146,7 @@ def test_the_earlier_pass_flew_where_it_is_said_to(monkeypatch):
     beam = boresight_on_terrain(R_E + moved, V_E, Q_BE, ALIGNED, LOOK, 0.0, flat_dem(100.0))
     assert made["middle"] == pytest.approx(beam.slant_range, abs=1e-3)
     assert made["time"] == pytest.approx(0.0, abs=1e-12)
+    assert made["side"] == 1
 
 
 def test_a_rendered_reference_errs_as_it_is_said_to():
@@ -180,6 +182,7 @@ def believing(**settings):
     acquired = SimpleNamespace(
         beam_range=np.array([861013.0]),
         beam_doppler=np.array([54.0]),
+        side=np.ones(1),
         fresh=np.ones(1, np.bool_),
     )
     P = np.diag(np.arange(1.0, 10.0))[None]
@@ -266,3 +269,13 @@ def test_a_fix_states_the_variance_of_what_it_measures():
     # along is east (y), across is south (z), up is x
     np.testing.assert_allclose(sent["D"][0], np.diag([25.0, 4.0, 9.0]), atol=1e-9)
     np.testing.assert_array_equal(sent["present"][0], [1, 1, 1, 1])
+
+
+def test_a_former_that_looks_to_the_other_side_than_its_echo_is_told_so():
+    former = believing()
+    former.acquired.side = -np.ones(1)
+    message = "'former' looks to the right of the track, but its echo came from the left"
+    with pytest.raises(ConfigurationError, match=message):
+        former._require_side(np.ones(1, np.bool_))
+    former.acquired.side = np.ones(1)
+    former._require_side(np.ones(1, np.bool_))

@@ -1,0 +1,234 @@
+r"""From an orbit to where an image lies on a reference, and from there to a place with covariance.
+
+A row of an image is when the beam's center passed, a column is a slant range; with the Doppler
+frequency of that center each pixel is a place on the terrain, as far as position and velocity are
+known, and that place has a pixel on the reference. Errors of position and velocity move the image
+on the reference, turn and stretch it a little: by how much is linearized about the estimate, in
+axes of its covariance, at a fixed height.
+
+What is recognized is a pixel of the reference, with a covariance :math:`C`. Its place :math:`p` on
+the terrain has
+
+.. math:: D = J C J^T + \sigma_a^2 a a^T + \sigma_c^2 c c^T + \sigma_u^2 w w^T, \qquad
+          J = \frac{\partial p}{\partial(i, j)}, \quad w = \frac{\partial p}{\partial h},
+
+with :math:`a, c` along the track and across it, and :math:`w` how the place moves where the terrain
+is higher than known: up, and in slant geometry towards the radar of the reference, for what was
+seen at a range is nearer if it is higher.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafix.models.core.arrays import FloatArray
+from terrafix.models.geometry.geodesy import ecef, geodetic
+from terrafix.models.geometry.geolocation import Height, ground_point, track_axes
+from terrafix.models.images.matching import Match, Prediction, searched_span
+from terrafix.models.images.reference import Reference
+from terrafix.models.motion.arc import earth_fixed_acceleration_array
+
+_SPACING, _MOST_NODES = 32.0, 33
+"""From one predicted pixel to the next, and most along an axis [pixels]."""
+_UNSURE = 5e-4
+"""Turn and growth that tie points of a reference may have wrong: half a pixel in a thousand."""
+_SPAN = 300.0
+"""About the heights found at first, that places are taken as parabolas of height in [m]."""
+_ROUNDS, _CLOSE = 60, 0.05
+_PIXELS, _RISE = 2.0, 5.0
+"""Differences for the slopes of a place, by pixels and by height [m]."""
+
+
+@dataclass(frozen=True)
+class View:
+    """How an image was seen, as an estimate has it.
+
+    Parameters
+    ----------
+    r, v : ndarray, shape (3,)
+        Position [m] and velocity [m/s] when the beam's center passed `row`, Earth-fixed.
+    row, column : float
+        Of the beam's center on the image, fractional.
+    row_time : float
+        From row to row [s].
+    slant_range, column_range : float
+        To the beam's center, and from column to column [m].
+    sine : float
+        Of the angle of the beam's center ahead of broadside.
+    side : {1, -1}
+        To the right of the track, or to the left.
+    time_sigma, range_sigma : float
+        Standard errors of time [s] and slant range [m].
+    """
+
+    r: FloatArray
+    v: FloatArray
+    row: float
+    column: float
+    row_time: float
+    slant_range: float
+    column_range: float
+    sine: float
+    side: int = 1
+    time_sigma: float = 0.0
+    range_sigma: float = 0.0
+
+    def points(self, rows: FloatArray, columns: FloatArray, height: FloatArray) -> FloatArray:
+        """Places (n_rows, n_columns, 3) [m] of pixels at heights (n_rows, n_columns) [m]."""
+        t = ((rows - self.row) * self.row_time)[:, None]
+        a = np.asarray(earth_fixed_acceleration_array(self.r, self.v))
+        r, v = self.r + self.v * t + a * t * t / 2, self.v + a * t
+        R = self.slant_range + (columns - self.column) * self.column_range
+        return ground_point(r[:, None], v[:, None], R, self.sine, height, self.side)
+
+
+def predicted(
+    view: View, P: FloatArray, reference: Reference, terrain: Height, shape: tuple[int, int]
+) -> Prediction:
+    """Where the pixels of an image, and those about it, lie on a reference.
+
+    Parameters
+    ----------
+    view : View
+    P : ndarray, shape (6, 6)
+        Covariance of position [m] and velocity [m/s].
+    reference : Reference
+    terrain : callable
+        Height [m] at latitudes and longitudes [rad]; NaN where it is not known.
+    shape : tuple of int
+        Rows and columns of the image.
+
+    Raises
+    ------
+    ValueError
+        If what is seen is not on the ground.
+    """
+    covariance, turn, growth = _uncertainty(view, P, terrain, shape)
+    axes = []
+    for n, variance in zip(shape, np.diag(covariance), strict=True):
+        low, high = searched_span(n, float(np.sqrt(variance)))
+        count = int(np.clip(np.ceil((high - low) / _SPACING) + 1, 2, _MOST_NODES))
+        axes.append(np.linspace(low, high, count))
+    latitude, longitude, height = _on_terrain(view, *axes, terrain)
+    row, column, _ = reference.pixel(latitude, longitude, height)
+    return Prediction(axes[0], axes[1], np.stack([row, column], axis=-1), covariance, turn, growth)
+
+
+def _uncertainty(
+    view: View, P: FloatArray, terrain: Height, shape: tuple[int, int]
+) -> tuple[FloatArray, float, float]:
+    """Covariance of an image's shift [pixels^2], sigma of its turn and growth, about its center."""
+    c = np.array([view.row]), np.array([view.column])
+    latitude, longitude, _ = geodetic(view.points(*c, np.zeros((1, 1)))[0, 0])
+    h = np.nan_to_num(np.asarray(terrain(latitude, longitude), np.float64))
+    rows, columns = (
+        np.array([center - n / 2, center, center + n / 2])
+        for center, n in zip((view.row, view.column), shape, strict=True)
+    )
+    at = np.full((3, 3), float(h))
+    own = view.points(rows, columns, at)
+    steps = np.stack([own[2, 1] - own[0, 1], own[1, 2] - own[1, 0]], axis=1) / np.array(shape)
+    onto = np.linalg.pinv(steps)
+    y, x = (a - center for a, center in ((rows, view.row), (columns, view.column)))
+    y, x = (a.ravel() for a in np.meshgrid(y, x, indexing="ij"))
+    one, none = np.ones(9), np.zeros(9)
+    design = np.stack(
+        [np.r_[one, none], np.r_[none, one], np.r_[-x, y], np.r_[y, x]], axis=1
+    )  # shift, turn, growth
+    values, vectors = np.linalg.eigh(P)
+    moved = []
+    for k, s in enumerate(np.sqrt(np.maximum(values, 0.0))):
+        if s == 0:
+            continue
+        off = s * vectors[:, k]
+        speed = np.linalg.norm(view.v) / np.linalg.norm(view.v + off[3:])
+        other = View(
+            *(view.r + off[:3], view.v + off[3:], view.row, view.column, view.row_time),
+            *(view.slant_range, view.column_range, view.sine * speed, view.side),
+        )
+        shift = (other.points(rows, columns, at) - own) @ onto.T
+        moved.append(np.linalg.lstsq(design, np.r_[shift[..., 0].ravel(), shift[..., 1].ravel()])[0])
+    M = np.reshape(moved, (-1, 4))
+    C = M.T @ M
+    measured = np.square([view.time_sigma / view.row_time, view.range_sigma / view.column_range])
+    turn, growth = (float(np.hypot(np.sqrt(C[k, k]), _UNSURE)) for k in (2, 3))
+    return C[:2, :2] + np.diag(measured), turn, growth
+
+
+def _on_terrain(
+    view: View, rows: FloatArray, columns: FloatArray, terrain: Height
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Latitude, longitude [rad] and height [m] of pixels, (n_rows, n_columns) each.
+
+    Along the height places are parabolas; where the terrain is not known, it is as its mean.
+    """
+    shape = len(rows), len(columns)
+    first = np.stack(geodetic(view.points(rows, columns, np.zeros(shape)))[:2])
+    found = np.asarray(terrain(*first), np.float64)
+    known = np.isfinite(found)
+    if not known.any():
+        found = np.zeros(shape)
+    low, high = float(np.nanmin(found)) - _SPAN, float(np.nanmax(found)) + _SPAN
+    middle, half = (low + high) / 2, (high - low) / 2
+    p = [geodetic(view.points(rows, columns, np.full(shape, h))) for h in (low, middle, high)]
+    a, b, c = (np.stack(q[:2]) for q in p)
+    a, c = (q - 2 * np.pi * np.rint((q - b) / (2 * np.pi)) for q in (a, c))
+    slope, bend = (c - a) / 2, (a + c) / 2 - b
+    mean = float(np.nanmean(found))
+    h = np.where(known, found, mean)
+    for _ in range(_ROUNDS):
+        u = np.clip((h - middle) / half, -1.5, 1.5)
+        latitude, longitude = b + slope * u + bend * u * u
+        there = np.asarray(terrain(latitude, longitude), np.float64)
+        rise = np.where(np.isfinite(there), there, mean) - h
+        h = h + 0.7 * rise
+        if np.abs(rise).max() < _CLOSE:
+            break
+    return latitude, longitude, h
+
+
+def placed(
+    reference: Reference, terrain: Height, match: Match, v: FloatArray, sigma: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Place (3,) [m] of a match on the terrain, and the covariance (3, 3) [m^2] of its error.
+
+    Parameters
+    ----------
+    reference : Reference
+    terrain : callable
+        Height [m] at latitudes and longitudes [rad].
+    match : Match
+    v : ndarray, shape (3,)
+        Velocity of who sees it [m/s], Earth-fixed.
+    sigma : ndarray, shape (3,)
+        Errors of the reference's places along the track and across it, and of its heights [m].
+
+    Raises
+    ------
+    ValueError
+        If it is outside the reference's tie points, or its height is not known.
+    """
+
+    def at(row: float, column: float, rise: float = 0.0) -> FloatArray:
+        def raised(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
+            return np.asarray(terrain(latitude, longitude) + rise)
+
+        return ecef(*reference.place_on(raised, row, column))
+
+    p = at(match.row, match.column)
+    J = np.empty((3, 2))
+    for k, knots in enumerate((reference.rows, reference.columns)):
+        ends = []
+        for sign in (1, -1):
+            pixel = np.array([match.row, match.column])
+            pixel[k] = np.clip(pixel[k] + sign * _PIXELS, knots[0], knots[-1])
+            ends.append((pixel[k], at(*pixel)))
+        J[:, k] = (ends[0][1] - ends[1][1]) / (ends[0][0] - ends[1][0])
+    w = (at(match.row, match.column, _RISE) - at(match.row, match.column, -_RISE)) / (2 * _RISE)
+    along, across, _ = track_axes(p, v)
+    D = J @ match.covariance @ J.T
+    for s, u in zip(sigma, (along, across, w), strict=True):
+        D += s * s * np.outer(u, u)
+    return p, D
