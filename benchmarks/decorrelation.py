@@ -79,9 +79,8 @@ def main() -> None:
                 errors = np.array([e for accepted, e in outcomes if accepted])
                 close = errors[errors < 3]
                 rms = np.sqrt((close**2).mean()) if len(close) else np.nan
-                cells.append(
-                    f"{len(errors):>8d} {rms:5.2f} {(errors > 1.5).sum():2d} {(errors > 3).sum():2d}"
-                )
+                wrong = [(errors > limit).sum() for limit in (1.5, 3.0)]
+                cells.append(f"{len(errors):>8d} {rms:5.2f} {wrong[0]:2d} {wrong[1]:2d}")
             print(f"{kind:10s}" + "".join(cells), flush=True)
     print(f"{time.process_time() - start:.0f} s")
 

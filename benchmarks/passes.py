@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.models.core.arrays import FloatArray, Single
-from terrafix.models.geometry.ground import EllipsoidGround, seen_on_terrain
-from terrafix.models.images.matching import Match, Prediction, Searchable, matched
+from terrafix.models.geometry.ground import EllipsoidGround
+from terrafix.models.images.matching import Match, Searchable, matched
+from terrafix.models.images.placing import View, predicted
 from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import Dem
 from terrafix.models.motion.arc import OrbitArc
@@ -24,10 +25,8 @@ from terrafix.models.radar.scene import Scene
 PALSAR = Radar(1269.768992e6, 2160.0, 16e6, -14e6 / 27e-6, 27e-6, 1513.0)
 EARTH = EllipsoidGround()
 LOOKS = (2, 1)
-METERS = np.array([6.3, 15.0])
-"""Lengths of a pixel on the ground along the track and across it [m]."""
-PRIOR = 300.0
-"""Standard error of the position by which images are sought, along each axis [m]."""
+PRIOR, PRIOR_SPEED = 300.0, 1.0
+"""Standard errors of position [m] and velocity [m/s] along each axis, in searching."""
 SPEED = 7599.0
 """Earth-fixed [m/s]."""
 HEADING, INCIDENCE = float(np.radians(-10.0)), float(np.radians(38.7))
@@ -141,19 +140,18 @@ def found(image: Seen, reference: Reference, dem: Dem, rng: np.random.Generator)
     rng : numpy.random.Generator
         Of the orbit's error.
     """
-    grid = image.grid
-    arc, error = grid.arc, PRIOR * rng.standard_normal(3)
-    r, v = arc.position(0.0), arc.velocity(0.0)
-    believed = OrbitArc(r + error, v, 0.0, *2 * (grid.n_lines / PALSAR.prf + 2.0,))
-    rows, columns = (np.linspace(0, n - 1, 17) for n in image.amplitude.shape)
-    lines, cells = (full_index(k, n) for k, n in zip((rows, columns), LOOKS, strict=True))
-    t, R = grid.first_time + lines / PALSAR.prf, grid.near_range + cells * PALSAR.range_spacing
-    r, v = (a[:, None, :] for a in (believed.position(t), believed.velocity(t)))
-    p = seen_on_terrain(EARTH, r, v, R[None, :], 0.0, dem.at)
-    row, column, _ = reference.pixel(*EARTH.geodetic(p)[:2])
-    covariance = np.diag((PRIOR * np.array([1.0, 1 / np.sin(INCIDENCE)]) / METERS) ** 2)
-    places = np.stack([row, column], axis=-1)
-    predicted = Prediction(rows, columns, places, covariance, 2e-3, 1e-3)
+    grid, (row, column) = image.grid, image.middle
+    line, cell = (full_index(k, n) for k, n in zip((row, column), LOOKS, strict=True))
+    t = grid.first_time + line / PALSAR.prf
+    view = View(
+        grid.arc.position(t) + PRIOR * rng.standard_normal(3),
+        grid.arc.velocity(t) + PRIOR_SPEED * rng.standard_normal(3),
+        *(row, column, LOOKS[0] / PALSAR.prf),
+        *(float(grid.near_range + cell * PALSAR.range_spacing), PALSAR.range_spacing * LOOKS[1]),
+        sine=0.0,
+    )
+    P = np.diag(np.repeat([PRIOR**2, PRIOR_SPEED**2], 3))
+    where = predicted(view, P, reference, dem.known_at, image.amplitude.shape)
     return matched(
-        Searchable(image.amplitude), Searchable(reference.amplitude), predicted, image.middle
+        Searchable(image.amplitude), Searchable(reference.amplitude), where, image.middle
     )
