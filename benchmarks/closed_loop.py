@@ -96,7 +96,7 @@ def open_loop(case: str, number: int) -> System:
     system = closed_loop(case, number)
     matcher, former = system.nodes["matcher"], system.nodes["former"]
     drawn = DrawnFix(
-        geolocation_sigma=matcher.setting("geolocation_sigma"),
+        geolocation_sigma=[0.35, 0.4, 0.3],
         velocity_sigma=former.setting("velocity_sigma"),
         range_sigma=former.setting("range_sigma"),
     )

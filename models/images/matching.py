@@ -15,8 +15,8 @@ with one mean [1]_. How much the first stands out of those after it has an F dis
 chance of a wrong one that stands out as much follows, for any number of shifts searched. Besides,
 the peak must be found again in several parts of the image, each by itself.
 
-**How far it is off.** Near the peak shift, rotation and scale :math:`\theta` of the image about its
-center follow from the score of correlation, :math:`g = \tfrac12 \sum (a\,\partial b - b\,\partial
+**How far it is off.** Near the peak the shift of the image and a linear map about its center,
+:math:`\theta`, follow from the score of correlation, :math:`g = \tfrac12 \sum (a\,\partial b - b\,\partial
 a)`, and its information, :math:`H = \sum \partial a\,\partial b^T`: products of the two images, in
 which the speckle of neither adds to it. The score is a sum over cells that are larger than speckle,
 and what it varies by is told by the cells [2]_, each held against the others' estimate,
@@ -25,12 +25,13 @@ and what it varies by is told by the cells [2]_, each held against the others' e
           \tilde g_c = (1 - H_c H^{-1})^{-1} g_c, \qquad
           \mathrm{cov}\,\theta = (H G^{-1} H + \Lambda)^{-1},
 
-where :math:`\Lambda` is what the prediction knows of rotation and scale. So these are free where
-the image tells more of them than the prediction does, and stay put where it does not: along a
-causeway nothing holds what is far from it but the prediction.
+where :math:`\Lambda` is what the prediction knows of the linear map: how an orbit's errors turn,
+stretch and shear an image. So it is free where the image tells more of it than the prediction does,
+and stays put where it does not: along a causeway nothing holds what is far from it but the
+prediction.
 
-Coordinates are (row, column), whole at the centers of pixels. Rotation is positive from columns to
-rows: by an angle :math:`\varphi`, (row, column) moves by :math:`(-\varphi\,column, \varphi\,row)`.
+Coordinates are (row, column), whole at the centers of pixels. A turn by an angle :math:`\varphi`
+moves (row, column) by :math:`(-\varphi\,column, \varphi\,row)`.
 
 References
 ----------
@@ -75,7 +76,7 @@ _DRAWN = 0.7
 interpolated of it prefers some fractions of a pixel [pixels]."""
 _STEP = 2
 """Pixels from one searched to the next, along each axis."""
-_SIGMAS = 3.0
+_SIGMAS = 3.5
 """How far off the prediction may be [sigma]."""
 _MARGIN = 64
 """Searched beyond that, to know how high wrong peaks are [pixels]."""
@@ -85,7 +86,7 @@ _LOBE = 6
 """Half the side of a peak: no other is counted there [searched pixels]."""
 _SPACINGS = 16
 """Peaks that the first one is held against."""
-_AMBIGUOUS = 1e-5
+_AMBIGUOUS = 1e-3
 """Chance that the highest of wrong peaks stands out so much: at most."""
 _CHANCE = 1e-7
 """Chance of that and of so many parts that agree with it: at most."""
@@ -95,6 +96,10 @@ _MOST = 41
 """Turns, and stretches, tried."""
 _CELL = 24
 """Side of cells whose speckle has nothing in common [pixels]."""
+_STIFF = 1e-5
+"""Least sigma of a linear map: a thousandth of a pixel in a hundred."""
+_LINEAR = np.ix_([1, 2, 4, 5], [1, 2, 4, 5])
+"""Of the six parameters of alignment, those that are a linear map."""
 _ROUNDS, _CLOSE, _STRIDE = 8, 0.01, 1.5
 """Of the alignment, its end, and its longest step [pixels]."""
 _RIM = 3
@@ -114,6 +119,10 @@ _SCATTER = 0.5
 """Largest standard error: three of them are the 1.5 pixels that a fix may be off."""
 
 
+_TURN, _GROWTH = np.array([0.0, -1.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0, 1.0])
+"""Elements of a linear map of (row, column), first row first, of a turn and of growth."""
+
+
 @dataclass(frozen=True)
 class Prediction:
     """Where the pixels of an image lie on a reference, as an orbit predicts it.
@@ -127,18 +136,16 @@ class Prediction:
         Row and column of those on the reference.
     covariance : ndarray, shape (2, 2)
         Of the shift of the image, in its own rows and columns [pixels^2].
-    rotation_sigma : float
-        Of its turn about its center [rad].
-    scale_sigma : float
-        Of its growth [-].
+    linear : ndarray, shape (4, 4)
+        Of how far rows and columns of the image are off by its rows and columns from the center:
+        of the elements of that matrix (2, 2), first row first [-].
     """
 
     rows: FloatArray
     columns: FloatArray
     places: FloatArray
     covariance: FloatArray
-    rotation_sigma: float = 0.0
-    scale_sigma: float = 0.0
+    linear: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
 
     def __post_init__(self) -> None:
         if self.places.shape != (len(self.rows), len(self.columns), 2):
@@ -151,6 +158,8 @@ class Prediction:
             raise ValueError("what is predicted of an image is not finite everywhere")
         if np.shape(self.covariance) != (2, 2) or np.linalg.eigvalsh(self.covariance)[0] < 0:
             raise ValueError("the covariance of an image's shift is no covariance (2, 2)")
+        if np.shape(self.linear) != (4, 4):
+            raise ValueError(f"the covariance 'linear' has shape {np.shape(self.linear)}")
 
     @staticmethod
     def affine(
@@ -159,12 +168,29 @@ class Prediction:
         rotation_sigma: float = 0.0,
         scale_sigma: float = 0.0,
     ) -> Prediction:
-        """Prediction by a transform (2, 3) of (row, column, 1) of the image to the reference."""
+        """Prediction by a transform (2, 3) of (row, column, 1) of the image to the reference.
+
+        With a covariance (2, 2) of its shift [pixels^2], and sigmas of the image's turn [rad] and
+        growth about its center.
+        """
         A, ends = np.asarray(transform, np.float64), np.array([0.0, 100.0])
         i, j = np.meshgrid(ends, ends, indexing="ij")
         places = np.stack([i, j, np.ones_like(i)], axis=-1) @ A.T
         covariance = np.asarray(covariance, np.float64)
-        return Prediction(ends, ends, places, covariance, rotation_sigma, scale_sigma)
+        linear = rotation_sigma**2 * np.outer(_TURN, _TURN) + scale_sigma**2 * np.outer(
+            _GROWTH, _GROWTH
+        )
+        return Prediction(ends, ends, places, covariance, linear)
+
+    @property
+    def rotation_sigma(self) -> float:
+        """Of the image's turn about its center [rad]."""
+        return float(np.sqrt(max(_TURN @ self.linear @ _TURN, 0.0))) / 2
+
+    @property
+    def scale_sigma(self) -> float:
+        """Of its growth [-]."""
+        return float(np.sqrt(max(_GROWTH @ self.linear @ _GROWTH, 0.0))) / 2
 
     def at(self, rows: ArrayLike, columns: ArrayLike) -> FloatArray:
         """Places on the reference, shape (n_rows, n_columns, 2), of rows and columns."""
@@ -215,8 +241,8 @@ class Match:
         That the highest of wrong peaks stands out as much, and as many parts agree with it.
     shift : ndarray, shape (2,)
         Of the center from where it was predicted, in the image's rows and columns [pixels].
-    rotation, scale : float
-        Of the image about its center, from the prediction [rad] and [-].
+    linear : ndarray, shape (2, 2)
+        Of the image about its center, from the prediction: its rows and columns by those.
     outline : ndarray, shape (4, 2)
         Corners of the image on the reference, first row first, then clockwise.
     blocks : ndarray, shape (n, 4)
@@ -231,8 +257,7 @@ class Match:
     correlation: float = 0.0
     chance: float = 1.0
     shift: FloatArray = field(default_factory=_nowhere)
-    rotation: float = 0.0
-    scale: float = 1.0
+    linear: FloatArray = field(default_factory=lambda: np.eye(2))
     outline: FloatArray = field(default_factory=lambda: np.full((4, 2), np.nan))
     blocks: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
 
@@ -329,13 +354,12 @@ class _Peak:
 
 @dataclass(frozen=True)
 class _Aligned:
-    """Of the alignment: from the image to the drawn reference, and its covariance (4, 4)."""
+    """Of the alignment: from the image to the drawn reference, and the shift's covariance (2, 2)."""
 
     transform: FloatArray
     covariance: FloatArray
     correlation: float
-    turn: float
-    growth: float
+    linear: FloatArray
 
 
 def matched(
@@ -386,7 +410,7 @@ def _judged(
     W = aligned.transform
     found = W @ [*center, 1.0] + drawn.first
     shift = found - center
-    covariance = W[:, :2] @ aligned.covariance[:2, :2] @ W[:, :2].T
+    covariance = W[:, :2] @ aligned.covariance @ W[:, :2].T
     slope = predicted.slope(*found)
     row, column = predicted.at(found[:1], found[1:])[0, 0]
     agreeing = _agreeing(image, drawn, W)
@@ -410,8 +434,7 @@ def _judged(
         aligned.correlation,
         chance,
         shift,
-        aligned.turn,
-        1 + aligned.growth,
+        aligned.linear,
         _placed(predicted, corners @ W.T + drawn.first),
         np.column_stack([agreeing, _placed(predicted, parts @ W.T + drawn.first)]),
     )
@@ -425,7 +448,7 @@ def _placed(predicted: Prediction, pixels: FloatArray) -> FloatArray:
 def _far(shift: FloatArray, covariance: FloatArray) -> bool:
     """Whether a shift is larger than its covariance allows."""
     covariance = covariance + 0.25 * np.eye(2)
-    return bool(shift @ np.linalg.solve(covariance, shift) > (_SIGMAS + 1) ** 2)
+    return bool(shift @ np.linalg.solve(covariance, shift) > (_SIGMAS + 0.5) ** 2)
 
 
 def searched_span(n: int, sigma: float) -> tuple[int, int]:
@@ -607,22 +630,22 @@ def _vertex(surface: Single, i: int, j: int) -> FloatArray:
 def _aligned(
     image: Searchable, drawn: _Drawn, predicted: Prediction, peak: _Peak, center: FloatArray
 ) -> _Aligned | None:
-    """Shift, turn and growth about the center that maximize correlation, from the peak on."""
+    """Shift and linear map about the center that maximize correlation, from the peak on."""
     middle = np.array([(n - 1) / 2 for n in image.shape])
     A = _linear(peak.turn, peak.growth)
     start = middle + peak.shift - drawn.first
     transform = np.column_stack([A, start - A @ middle])
     unit = float(np.hypot(*image.shape)) / 4
-    sigmas = np.maximum([predicted.rotation_sigma, predicted.scale_sigma], 1e-7) * unit
-    known = np.diag([0.0, 0.0, *(sigmas**-2.0)])
-    off = np.array([0.0, 0.0, peak.turn, peak.growth]) * [1, 1, unit, unit]
-    levels = ("coarse", "fine") if np.any(off) else ("fine",)
-    for level in levels:
+    known = np.zeros((6, 6))
+    known[_LINEAR] = np.linalg.inv(unit**2 * (predicted.linear + _STIFF**2 * np.eye(4)))
+    off = np.zeros(6)
+    off[_LINEAR[0].ravel()] = unit * (A - np.eye(2)).ravel()
+    for level in ("coarse", "fine") if off.any() else ("fine",):
         a, b = getattr(image.layers, level), getattr(drawn.layers, level)
         patch = _Patch(a, center, unit)
         for _ in range(_ROUNDS):
             score, H, G = patch.held_against(_warped(b, transform, a.shape))
-            if np.linalg.eigvalsh(H[:2, :2])[0] <= 0:
+            if np.linalg.eigvalsh(H[np.ix_([0, 3], [0, 3])])[0] <= 0:
                 return None
             weight = H @ np.linalg.inv(G)
             covariance = np.linalg.inv(weight @ H + known)
@@ -630,21 +653,25 @@ def _aligned(
             if not np.isfinite(step).all():
                 return None
             step *= min(1.0, _STRIDE / max(float(np.abs(step).max()), 1e-9))
-            off = off + step * [0, 0, 1, 1]
-            transform = _moved(transform, step / [1, 1, unit, unit], center)
+            off = off + step * [0, 1, 1, 0, 1, 1]
+            transform = _moved(transform, step, center, unit)
             if np.abs(step).max() < _CLOSE:
                 break
     if np.abs(step).max() > 10 * _CLOSE:
         return None
     warped = _warped(b, transform, a.shape)
     correlation = float(np.corrcoef(a.ravel(), warped.ravel())[0, 1])
-    return _Aligned(transform, covariance, correlation, off[2] / unit, off[3] / unit)
+    linear = np.eye(2) + off[_LINEAR[0].ravel()].reshape(2, 2) / unit
+    return _Aligned(transform, covariance[np.ix_([0, 3], [0, 3])], correlation, linear)
 
 
-def _moved(transform: FloatArray, step: FloatArray, center: FloatArray) -> FloatArray:
-    """A transform (2, 3) of an image that is first shifted, turned and grown about its center."""
-    A = _linear(step[2], step[3])
-    t = center + step[:2] - A @ center
+def _moved(
+    transform: FloatArray, step: FloatArray, center: FloatArray, unit: float
+) -> FloatArray:
+    """A transform (2, 3) of an image that is first shifted and deformed about its center."""
+    shift, slopes = step.reshape(2, 3)[:, 0], step.reshape(2, 3)[:, 1:]
+    A = np.eye(2) + slopes / unit
+    t = center + shift - A @ center
     return np.column_stack([transform[:, :2] @ A, transform[:, :2] @ t + transform[:, 2]])
 
 
@@ -658,41 +685,43 @@ def _warped(b: Single, transform: FloatArray, shape: tuple[int, ...], rim: int =
 
 
 class _Patch:
-    """An image whose correlation with another is a function of shift, turn and growth.
+    """An image whose correlation with another is a function of six parameters.
 
-    Turn and growth are counted in pixels of those `unit` away from the center.
+    Of rows, then of columns: their shift, and how it grows by rows and by columns from the center,
+    in pixels of those `unit` away from it. Within a cell the shift is taken as one.
     """
 
     def __init__(self, a: Single, center: FloatArray, unit: float) -> None:
-        inner = (slice(_RIM, -_RIM),) * 2
-        self._inner = inner
-        y, x = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in a.shape), indexing="ij")
-        self._y = (y[inner] - np.float32(center[0])) / np.float32(unit)
-        self._x = (x[inner] - np.float32(center[1])) / np.float32(unit)
+        self._inner = (slice(_RIM, -_RIM),) * 2
         self._a, self._slopes = self._normalized(a)
+        y, x = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in a.shape), indexing="ij")
+        inner = np.stack([np.ones_like(y), y - center[0], x - center[1]])[
+            (slice(None), *self._inner)
+        ]
+        one, down, across = _cells(inner)
+        self._where = np.stack([np.ones_like(one), down / one / unit, across / one / unit])
 
     def _normalized(self, a: Single) -> tuple[Single, Single]:
-        """An image and its slopes along the parameters (4, ...), of unit power."""
-        down, across = (g[self._inner] for g in np.gradient(a))
+        """An image and its slopes down and across (2, ...), of unit power."""
+        slopes = np.stack([g[self._inner] for g in np.gradient(a)])
         inner = a[self._inner]
-        y, x = self._y, self._x
-        slopes = np.stack([down, across, y * across - x * down, y * down + x * across])
-        scale = 1 / np.sqrt(max(float(np.mean(inner * inner)), 1e-12))
-        return inner * np.float32(scale), slopes * np.float32(scale)
+        scale = np.float32(1 / np.sqrt(max(float(np.mean(inner * inner)), 1e-12)))
+        return inner * scale, slopes * scale
 
     def held_against(self, b: Single) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Score (4,) of correlation, its information and its covariance (4, 4) each."""
+        """Score (6,) of correlation, its information and its covariance (6, 6) each."""
         other, slopes = self._normalized(b)
-        g = _cells(self._a * slopes - other * self._slopes) / 2
-        one = np.stack([_cells(s * slopes) for s in self._slopes])
-        H = (one + one.swapaxes(0, 1)) / 2
-        score, total = g.sum(axis=-1), H.sum(axis=-1)
-        floor = 1e-9 * np.trace(total) * np.eye(4)
-        share = np.einsum("ijn,jk->nik", H, np.linalg.pinv(total))
-        share *= np.minimum(1, 0.9 / np.maximum(np.linalg.norm(share, axis=(1, 2)), 1e-9))[
-            :, None, None
-        ]
-        alone = np.linalg.solve(np.eye(4) - share, g.T[..., None])[..., 0]
+        own, q = self._slopes, self._where
+        g = np.einsum("kn,pn->nkp", _cells(self._a * slopes - other * own) / 2, q).reshape(-1, 6)
+        (rr, cc), rc = _cells(own * slopes), _cells(own[0] * slopes[1] + own[1] * slopes[0]) / 2
+        h = np.array([[rr, rc], [rc, cc]])
+        H = np.einsum("kln,pn,qn->nkplq", h, q, q).reshape(-1, 6, 6)
+        score, total = g.sum(axis=0), H.sum(axis=0)
+        share = H @ np.linalg.pinv(total)
+        size = np.linalg.norm(share, axis=(1, 2))
+        share *= np.minimum(1, 0.9 / np.maximum(size, 1e-9))[:, None, None]
+        alone = np.linalg.solve(np.eye(6) - share, g[..., None])[..., 0]
+        floor = 1e-9 * max(float(np.trace(total)), 1e-9) * np.eye(6)
         return score, total, alone.T @ alone + floor
 
 

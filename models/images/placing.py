@@ -19,9 +19,10 @@ seen at a range is nearer if it is higher.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.geometry.geodesy import ecef, geodetic
@@ -33,10 +34,12 @@ from terrafix.models.motion.arc import earth_fixed_acceleration_array
 _SPACING, _MOST_NODES = 32.0, 33
 """From one predicted pixel to the next, and most along an axis [pixels]."""
 _UNSURE = 5e-4
-"""Turn and growth that tie points of a reference may have wrong: half a pixel in a thousand."""
+"""Of a linear map, that tie points of a reference may have wrong: half a pixel in a thousand."""
 _SPAN = 300.0
 """About the heights found at first, that places are taken as parabolas of height in [m]."""
 _ROUNDS, _CLOSE = 60, 0.05
+_FEWEST, _ROUGH = 24, 0.3
+"""Nodes that a parabola is put through, and what it may leave of them (rms) [pixels]."""
 _PIXELS, _RISE = 2.0, 5.0
 """Differences for the slopes of a place, by pixels and by height [m]."""
 
@@ -105,21 +108,38 @@ def predicted(
     ValueError
         If what is seen is not on the ground.
     """
-    covariance, turn, growth = _uncertainty(view, P, terrain, shape)
+    covariance, linear = _uncertainty(view, P, terrain, shape)
     axes = []
     for n, variance in zip(shape, np.diag(covariance), strict=True):
         low, high = searched_span(n, float(np.sqrt(variance)))
         count = int(np.clip(np.ceil((high - low) / _SPACING) + 1, 2, _MOST_NODES))
         axes.append(np.linspace(low, high, count))
     latitude, longitude, height = _on_terrain(view, *axes, terrain)
-    row, column, _ = reference.pixel(latitude, longitude, height)
-    return Prediction(axes[0], axes[1], np.stack([row, column], axis=-1), covariance, turn, growth)
+    row, column, inside = reference.pixel(latitude, longitude, height)
+    places = _smooth(np.stack([row, column], axis=-1), inside)
+    return Prediction(axes[0], axes[1], places, covariance, linear)
+
+
+def _smooth(places: FloatArray, inside: NDArray[np.bool_]) -> FloatArray:
+    """Places (n_i, n_j, 2) as a parabola of their row and column, where they nearly are one.
+
+    In slant geometry they are, as two radars see relief nearly alike. What is not smooth comes of
+    where the estimate sees it from, wrongly: a tenth of a pixel, of which the center would have
+    its own part. Of a map that is not in slant geometry relief is real, and is kept.
+    """
+    if inside.sum() < _FEWEST:
+        return places
+    i, j = np.meshgrid(*(np.linspace(-1, 1, n) for n in inside.shape), indexing="ij")
+    terms = np.stack([np.ones_like(i), i, j, i * i, i * j, j * j], axis=-1)
+    fitted = terms @ np.linalg.lstsq(terms[inside], places[inside], rcond=None)[0]
+    rough = np.sqrt(np.mean((places - fitted)[inside] ** 2, axis=0))
+    return fitted if rough.max() < _ROUGH else places
 
 
 def _uncertainty(
     view: View, P: FloatArray, terrain: Height, shape: tuple[int, int]
-) -> tuple[FloatArray, float, float]:
-    """Covariance of an image's shift [pixels^2], sigma of its turn and growth, about its center."""
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances of an image's shift (2, 2) [pixels^2] and of a linear map of it (4, 4)."""
     c = np.array([view.row]), np.array([view.column])
     latitude, longitude, _ = geodetic(view.points(*c, np.zeros((1, 1)))[0, 0])
     h = np.nan_to_num(np.asarray(terrain(latitude, longitude), np.float64))
@@ -131,30 +151,20 @@ def _uncertainty(
     own = view.points(rows, columns, at)
     steps = np.stack([own[2, 1] - own[0, 1], own[1, 2] - own[1, 0]], axis=1) / np.array(shape)
     onto = np.linalg.pinv(steps)
-    y, x = (a - center for a, center in ((rows, view.row), (columns, view.column)))
-    y, x = (a.ravel() for a in np.meshgrid(y, x, indexing="ij"))
-    one, none = np.ones(9), np.zeros(9)
-    design = np.stack(
-        [np.r_[one, none], np.r_[none, one], np.r_[-x, y], np.r_[y, x]], axis=1
-    )  # shift, turn, growth
+    y, x = np.meshgrid(rows - view.row, columns - view.column, indexing="ij")
+    design = np.stack([np.ones(9), y.ravel(), x.ravel()], axis=1)
     values, vectors = np.linalg.eigh(P)
     moved = []
-    for k, s in enumerate(np.sqrt(np.maximum(values, 0.0))):
-        if s == 0:
-            continue
-        off = s * vectors[:, k]
-        speed = np.linalg.norm(view.v) / np.linalg.norm(view.v + off[3:])
-        other = View(
-            *(view.r + off[:3], view.v + off[3:], view.row, view.column, view.row_time),
-            *(view.slant_range, view.column_range, view.sine * speed, view.side),
-        )
-        shift = (other.points(rows, columns, at) - own) @ onto.T
-        moved.append(np.linalg.lstsq(design, np.r_[shift[..., 0].ravel(), shift[..., 1].ravel()])[0])
-    M = np.reshape(moved, (-1, 4))
-    C = M.T @ M
+    for s, vector in zip(np.sqrt(np.maximum(values, 0.0)), vectors.T, strict=True):
+        r, v = view.r + s * vector[:3], view.v + s * vector[3:]
+        sine = view.sine * float(np.linalg.norm(view.v) / np.linalg.norm(v))
+        other = replace(view, r=r, v=v, sine=sine)
+        shift = ((other.points(rows, columns, at) - own) @ onto.T).reshape(9, 2)
+        moved.append(np.linalg.lstsq(design, shift, rcond=None)[0].T)
+    M = np.array(moved)  # axes of the covariance, row and column, shift and by rows and columns
     measured = np.square([view.time_sigma / view.row_time, view.range_sigma / view.column_range])
-    turn, growth = (float(np.hypot(np.sqrt(C[k, k]), _UNSURE)) for k in (2, 3))
-    return C[:2, :2] + np.diag(measured), turn, growth
+    shifts, slopes = M[:, :, 0], M[:, :, 1:].reshape(-1, 4)
+    return shifts.T @ shifts + np.diag(measured), slopes.T @ slopes + _UNSURE**2 * np.eye(4)
 
 
 def _on_terrain(
