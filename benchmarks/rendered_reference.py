@@ -5,8 +5,8 @@
 Every image has a place, a surface, speckle and an orbit of its own; what is known of the terrain,
 of each class's brightness and of where both lie errs anew. Printed are the share that is
 recognized, the errors of what was accepted, in pixels of the reference and in meters on the ground,
-what map and heights alone account for,
-and the mean square of errors normalized by the covariance of the fix.
+what map and heights alone account for, and the mean square of errors normalized by the covariance
+of the fix.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,8 @@ def trial(number: int, dem: Dem, options: argparse.Namespace) -> dict[str, objec
     known = dem
     if options.height:
         known = roughened(dem, options.height, options.length, number)
+    datum = options.datum * float(rng.standard_normal())
+    known = replace(known, height=known.height + np.float32(datum))
     cover = CoverMap(
         known, seed=seed, cover=options.cover, class_sigma=options.brightness, map_seed=number
     )
@@ -56,7 +59,9 @@ def trial(number: int, dem: Dem, options: argparse.Namespace) -> dict[str, objec
     row, column, inside = reference.pixel(image.place[0], image.place[1])
     out = {"accepted": match.accepted, "reason": match.reason, "inside": bool(inside)}
     if match.accepted:
-        sigma = np.array([options.placing, options.placing, options.height])
+        across = np.hypot(options.placing, options.datum / np.tan(INCIDENCE))
+        up = np.hypot(options.height, options.datum)
+        sigma = np.array([options.placing, across, up])
         velocity = true.arc.velocity(0.0)
         p, D = placed(reference, known.at, match, velocity, sigma)
         error = p - EARTH.point(*image.place)
@@ -77,6 +82,7 @@ def main() -> None:
     parser.add_argument("--classes", type=int, default=1, help="0: relief alone")
     parser.add_argument("--brightness", type=float, default=1.5, help="error of classes [dB]")
     parser.add_argument("--placing", type=float, default=3.0, help="error of places [m]")
+    parser.add_argument("--datum", type=float, default=0.0, help="error of all heights [m]")
     parser.add_argument("--tile", type=Path, help="another elevation model, a degree square")
     options = parser.parse_args()
     start, dem = time.process_time(), read_jacksboro().tiled()
@@ -101,7 +107,8 @@ def main() -> None:
         print(f"{name}: mean {values.mean(axis=0).round(2)}, rms {rms.round(2)}")
     print(f"normalized square of the errors: {np.mean([o['square'] for o in right]):.2f} of 3")
     across = np.hypot(options.placing, options.height / np.tan(INCIDENCE))
-    print(f"of map and heights alone: {options.placing:.2f}, {across:.2f}, {options.height:.2f} m")
+    up = np.hypot(options.height, options.datum)
+    print(f"of map and heights alone: {options.placing:.2f}, {across:.2f}, {up:.2f} m")
 
 
 if __name__ == "__main__":
