@@ -75,8 +75,8 @@ class Districts:
 
 def words(seed: int, name: str, *parts: NDArray[np.int64] | Words | int) -> Words:
     """A random 64-bit number of every element of some whole numbers (SplitMix64)."""
-    start = np.random.SeedSequence([seed & 0xFFFFFFFF, *name.encode()]).generate_state(1, np.uint64)
-    out = start
+    start = np.random.SeedSequence([seed & 0xFFFFFFFF, *name.encode()])
+    out = np.asarray(start.generate_state(1, np.uint64), np.uint64)
     with np.errstate(over="ignore"):
         for part in parts:
             out = out ^ np.asarray(part).astype(np.uint64)
