@@ -25,7 +25,9 @@ and what it varies by is told by the cells [2]_, each held against the others' e
           \tilde g_c = (1 - H_c H^{-1})^{-1} g_c, \qquad
           \mathrm{cov}\,\theta = (H G^{-1} H + \Lambda)^{-1},
 
-where :math:`\Lambda` is what the prediction knows of the linear map: how an orbit's errors turn,
+:math:`G` is larger by :math:`\nu / (\nu - 2)`, the variance of Student's distribution, as cells
+tell it with :math:`\nu = (\sum_c \tilde g_c^2)^2 / \sum_c \tilde g_c^4` degrees of freedom.
+:math:`\Lambda` is what the prediction knows of the linear map: how an orbit's errors turn,
 stretch and shear an image. So it is free where the image tells more of it than the prediction does,
 and stays put where it does not: along a causeway nothing holds what is far from it but the
 prediction.
@@ -639,7 +641,7 @@ def _aligned(
     known = np.zeros((6, 6))
     known[_LINEAR] = np.linalg.inv(unit**2 * (predicted.linear + _STIFF**2 * np.eye(4)))
     off = np.zeros(6)
-    off[_LINEAR[0].ravel()] = unit * (A - np.eye(2)).ravel()
+    off[_LINEAR[0].ravel()] = unit * (peak.turn * _TURN + peak.growth * _GROWTH)
     for level in ("coarse", "fine") if off.any() else ("fine",):
         a, b = getattr(image.layers, level), getattr(drawn.layers, level)
         patch = _Patch(a, center, unit)
@@ -661,7 +663,7 @@ def _aligned(
         return None
     warped = _warped(b, transform, a.shape)
     correlation = float(np.corrcoef(a.ravel(), warped.ravel())[0, 1])
-    linear = np.eye(2) + off[_LINEAR[0].ravel()].reshape(2, 2) / unit
+    linear = transform[:, :2]
     return _Aligned(transform, covariance[np.ix_([0, 3], [0, 3])], correlation, linear)
 
 
@@ -721,8 +723,11 @@ class _Patch:
         size = np.linalg.norm(share, axis=(1, 2))
         share *= np.minimum(1, 0.9 / np.maximum(size, 1e-9))[:, None, None]
         alone = np.linalg.solve(np.eye(6) - share, g[..., None])[..., 0]
+        power = np.sum(alone[:, [0, 3]] ** 2, axis=1)
+        freedom = float(power.sum()) ** 2 / max(float(np.sum(power**2)), 1e-30)
+        few = freedom / max(freedom - 2, 0.5)
         floor = 1e-9 * max(float(np.trace(total)), 1e-9) * np.eye(6)
-        return score, total, alone.T @ alone + floor
+        return score, total, few * (alone.T @ alone) + floor
 
 
 def _cells(x: Single) -> FloatArray:

@@ -250,8 +250,8 @@ def test_the_error_of_the_autofocus_is_part_of_the_velocitys(monkeypatch, accept
 
 
 def test_a_fix_states_the_variance_of_what_it_measures():
-    """R holds squares; D is diag(sigma^2) along the track, across it and up, in Earth axes."""
-    matcher = ImageMatcher(range_sigma=1.5, geolocation_sigma=[2.0, 3.0, 5.0])
+    """R holds squares; of a time known to 1 ms 7 m of the track are 8.75e-6 of the range."""
+    matcher = ImageMatcher(range_sigma=1.5)
     sent = {}
     fix = SimpleNamespace(publish=lambda t, **fields: sent.update(fields, t=t))
     image = SimpleNamespace(
@@ -259,15 +259,16 @@ def test_a_fix_states_the_variance_of_what_it_measures():
         velocity=np.array([7100.0]),
         velocity_sigma=np.array([0.4]),
         focused=np.array([1.0]),
+        time_sigma=np.array([1e-3]),
     )
-    east = SimpleNamespace(v_e=np.array([[0.0, 7000.0, 0.0]]))  # at the equator and Greenwich
+    east = SimpleNamespace(v_e=np.array([[0.0, 7000.0, 0.0]]))
     bound(matcher, "matcher", fix=fix, image=image, prior=east)
-    matcher._publish(8.2, np.array([[0.0, 0.0, 50.0]]), np.array([True]))
+    place, D = np.array([[EARTH.radius + 50.0, 0.0, 0.0]]), np.diag([25.0, 4.0, 9.0])[None]
+    matcher._publish(8.2, place, D, np.array([True]))
     np.testing.assert_allclose(sent["y"][0], [0, 0, 8e5, 7100.0])
-    np.testing.assert_allclose(sent["R"][0], np.diag([0.0, 0.0, 1.5**2, 0.4**2]))
-    np.testing.assert_allclose(sent["r_f_e"][0], [EARTH.radius + 50.0, 0, 0])
-    # along is east (y), across is south (z), up is x
-    np.testing.assert_allclose(sent["D"][0], np.diag([25.0, 4.0, 9.0]), atol=1e-9)
+    np.testing.assert_allclose(sent["R"][0], np.diag([8.75e-6**2, 0.0, 1.5**2, 0.4**2]))
+    np.testing.assert_allclose(sent["r_f_e"], place)
+    np.testing.assert_allclose(sent["D"], D)
     np.testing.assert_array_equal(sent["present"][0], [1, 1, 1, 1])
 
 
