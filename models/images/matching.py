@@ -13,7 +13,10 @@ fall off like those of a Gaussian field, so of the squares of wrong ones in fall
 :math:`E_1 > E_2 > \dots` the spacings :math:`i (E_i - E_{i+1})` are independent and exponential
 with one mean [1]_. How much the first stands out of those after it has an F distribution, and the
 chance of a wrong one that stands out as much follows, for any number of shifts searched. Besides,
-the peak must be found again in several parts of the image, each by itself.
+the peak must be found again in several parts of the image, each by itself. Around the right peak
+the reference resembles itself, along ridges and streets: what its own correlation explains is no wrong
+peak, but a place that is half alike counts by how likely it is, :math:`e^{-\rho (\rho - \rho_k) /
+\sigma^2}` with :math:`\sigma` the noise of correlation.
 
 **How far it is off.** Near the peak the shift of the image and a linear map about its center,
 :math:`\theta`, follow from the score of correlation, :math:`g = \tfrac12 \sum (a\,\partial b - b\,\partial
@@ -86,6 +89,8 @@ _SEEN = 0.8
 """Share of the image that must lie on the reference."""
 _LOBE = 6
 """Half the side of a peak: no other is counted there [searched pixels]."""
+_ALIKE = 0.5
+"""Correlation of a reference with itself, from which on two places resemble each other."""
 _SPACINGS = 16
 """Peaks that the first one is held against."""
 _AMBIGUOUS = 1e-3
@@ -593,8 +598,8 @@ def _standing_out(
     others = np.where(surface == 0, 0, surface - surface[i, j] * alike)
     noise = float(others[surface != 0].std())
     chance = _spaced_out(_elsewhere(others, i, j), float(surface[i, j]))
-    again = _elsewhere(surface, i, j)
     # how much likelier the place is than others that resemble it
+    again = _elsewhere(np.where(alike > _ALIKE, surface, 0), i, j)
     ahead = float(surface[i, j]) * (float(surface[i, j]) - again) / max(noise, 1e-6) ** 2
     return i, j, min(chance + float(np.exp(-np.clip(ahead, 0, 700)).sum()), 1.0)
 
@@ -667,9 +672,7 @@ def _aligned(
     return _Aligned(transform, covariance[np.ix_([0, 3], [0, 3])], correlation, linear)
 
 
-def _moved(
-    transform: FloatArray, step: FloatArray, center: FloatArray, unit: float
-) -> FloatArray:
+def _moved(transform: FloatArray, step: FloatArray, center: FloatArray, unit: float) -> FloatArray:
     """A transform (2, 3) of an image that is first shifted and deformed about its center."""
     shift, slopes = step.reshape(2, 3)[:, 0], step.reshape(2, 3)[:, 1:]
     A = np.eye(2) + slopes / unit
