@@ -91,12 +91,12 @@ def closed_loop(case: str, number: int) -> System:
     return system
 
 
-def open_loop(case: str, number: int) -> System:
-    """The same without images: errors of the fix are drawn from its covariances."""
+def open_loop(case: str, number: int, sigma: np.ndarray) -> System:
+    """The same without images: errors of the fix are drawn with standard errors (3,) [m]."""
     system = closed_loop(case, number)
-    matcher, former = system.nodes["matcher"], system.nodes["former"]
+    former = system.nodes["former"]
     drawn = DrawnFix(
-        geolocation_sigma=[0.35, 0.4, 0.3],
+        geolocation_sigma=sigma,
         velocity_sigma=former.setting("velocity_sigma"),
         range_sigma=former.setting("range_sigma"),
     )
@@ -121,13 +121,16 @@ def outcome(system: System, number: int, members: int) -> dict[str, Any]:
         values = data[name]
         return values.sel({values.dims[0]: t}, method="nearest").to_numpy()
 
-    found: dict[str, Any] = {k: [] for k in ("fix", "velocity", "accepted", "reason", "error", "P")}
+    found: dict[str, Any] = {
+        k: [] for k in ("fix", "D", "velocity", "accepted", "reason", "error", "P")
+    }
     for t in map(float, TIMES):
         r, v = at("orbit.r_e", t), at("orbit.v_e", t)
         q_be, q_mu = at("attitude.q_be", t), at("antenna.q_mu", t)
         beam = boresight(r[0], v[0], q_be[0], q_mu[0])
         axes = track_axes(beam.point, v[0])
         found["fix"].append((at("matcher.fix.r_f_e", t) - beam.point) @ axes.T)
+        found["D"].append(axes @ at("matcher.fix.D", t) @ axes.T)
         V = effective_velocity_array(r[0], v[0], beam.point)
         y, present = at("matcher.fix.y", t), at("matcher.fix.present", t)
         found["velocity"].append(np.where(present[:, 3] > 0, y[:, 3] - V, np.nan))
@@ -152,6 +155,13 @@ def fixes(closed: list[dict[str, Any]]) -> None:
             f"  {axis:7s} mean {m:6.2f} m = {m / s:5.1f} standard errors; rms "
             f"{np.sqrt(np.mean(e**2)):.2f} m, largest {np.abs(e).max():.2f} m"
         )
+    D = np.array([s["D"][k, 0] for s in closed for k in range(3)])[np.isfinite(first[:, 0])]
+    ratios = errors / np.sqrt(np.diagonal(D, axis1=1, axis2=2))
+    square = np.mean([e @ np.linalg.solve(d, e) for e, d in zip(errors, D, strict=True)]) / 3
+    print(
+        f"  error over sigma, rms {np.round(np.sqrt(np.mean(ratios**2, axis=0)), 2)}, largest "
+        f"{np.abs(ratios).max():.1f}; normalized square {square:.2f}"
+    )
     print("  covariance [m^2]", np.round(np.cov(errors.T), 2).tolist())
     starts = np.concatenate([s["velocity"].ravel() for s in closed])
     V, share = starts[np.isfinite(starts)], 100 * np.mean(np.abs(starts) < 1.5)
@@ -200,7 +210,10 @@ def table(case: str, sets: int, members: int) -> None:
     closed = [outcome(closed_loop(case, k), k, members) for k in range(sets)]
     print(f"closed loop, {case}: {sets} sets of {members}, {time.perf_counter() - started:.0f} s")
     fixes(closed)
-    updates(closed, [outcome(open_loop(case, k), k, max(members, 60)) for k in range(sets)])
+    D = np.concatenate([s["D"].reshape(-1, 3, 3) for s in closed])
+    sigma = np.sqrt(np.nanmean(np.diagonal(D, axis1=1, axis2=2), axis=0))
+    opened = [outcome(open_loop(case, k, sigma), k, max(members, 60)) for k in range(sets)]
+    updates(closed, opened)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GiB, {time.perf_counter() - started:.0f} s")
 

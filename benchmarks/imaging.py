@@ -1,6 +1,6 @@
 """Speed of the imaging chain, and autofocus and matching on recorded echo.
 
-    python benchmarks/imaging.py [--starts 100] [--places 100] [--seeds 1] [--trials 3000] [--only matching]
+    python benchmarks/imaging.py [--places 100] [--trials 3000] [--only matching]
 
 Autofocus and matching need the recording (TERRAFIX_DATA); without it they are left out.
 """
@@ -139,7 +139,7 @@ def focusing(domains: dict[str, RangeDoppler], starts: int) -> None:
 def chip(
     amplitude: np.ndarray, rng: np.random.Generator, turn: float, size: int = SIZE
 ) -> tuple[Searchable, np.ndarray]:
-    """A chip at random, turned up to so many degrees, and its middle; whole pixels if not turned."""
+    """A chip at random, turned up to so many degrees, and its middle: whole pixels if it is not."""
     if turn == 0:
         first = np.array([rng.integers(0, n - size + 1) for n in amplitude.shape])
         (i, j), middle = first, first + (size - 1) / 2
@@ -200,7 +200,6 @@ def matching(domains: dict[str, RangeDoppler], places: int, seed: int) -> None:
         for k, (name, (one, _)) in enumerate(looks.items()):
             rng = np.random.default_rng([seed, k])
             errors, ratios, n = [], [], 0
-            started = time.process_time()
             spent = 0.0
             for _ in range(places):
                 image, middle = chip(one, rng, turn)

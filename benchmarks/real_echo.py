@@ -128,7 +128,7 @@ def open_loop() -> System:
     system = real_echo()
     parts = system.nodes
     drawn = CommonFix(
-        geolocation_sigma=parts["matcher"].setting("geolocation_sigma"),
+        geolocation_sigma=parts["matcher"].setting("reference_sigma"),
         velocity_sigma=parts["former"].setting("velocity_sigma"),
         range_sigma=parts["former"].setting("range_sigma"),
         look=parts["echo"].setting("look"),

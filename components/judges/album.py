@@ -36,7 +36,9 @@ class ImageAlbum(Component):
     unfocused = SharedInput((None, None), dtype=np.float32, doc="the first one before autofocus")
     image = MessageInput(fields=IMAGE, doc="which image is a member's, and what it measures")
     amplitude = SharedInput(**AMPLITUDE, doc="of the reference")
-    inliers = SharedInput((None, 4), doc="features of the first image and of the reference")
+    inliers = SharedInput(
+        (None, 4), doc="middles of its parts that agree, on it and on the reference"
+    )
     outline = SharedInput((4, 2), doc="corners of the first image on the reference")
     position_error = Input((3,), unit="m", frame="e", doc="estimate minus truth")
     position_sigma = Input((3,), unit="m", frame="e", doc="predicted")
@@ -124,7 +126,7 @@ class ImageAlbum(Component):
         titles = (
             f"{'a detail' if self.detail > 1 else 'the image'} at {page['t']:g} s, as estimated",
             "the same, autofocused",
-            f"recognized on the reference: {len(page['inliers'])} features",
+            f"recognized on the reference: {len(page['inliers'])} parts agree",
         )
         detail = _about_the_brightest(page["focused"], self.detail)
         shown = (page["unfocused"][detail], page["focused"][detail], page["reference"])

@@ -19,10 +19,11 @@ peak, but a place that is half alike counts by how likely it is, :math:`e^{-\rho
 \sigma^2}` with :math:`\sigma` the noise of correlation.
 
 **How far it is off.** Near the peak the shift of the image and a linear map about its center,
-:math:`\theta`, follow from the score of correlation, :math:`g = \tfrac12 \sum (a\,\partial b - b\,\partial
-a)`, and its information, :math:`H = \sum \partial a\,\partial b^T`: products of the two images, in
-which the speckle of neither adds to it. The score is a sum over cells that are larger than speckle,
-and what it varies by is told by the cells [2]_, each held against the others' estimate,
+:math:`\theta`, follow from the score of correlation,
+:math:`g = \tfrac12 \sum (a\,\partial b - b\,\partial a)`, and its information,
+:math:`H = \sum \partial a\,\partial b^T`: products of the two images, in which the speckle of
+neither adds to it. The score is a sum over cells that are larger than speckle, and what it varies
+by is told by the cells [2]_, each held against the others' estimate,
 
 .. math:: G = \sum_c \tilde g_c \tilde g_c^T, \quad
           \tilde g_c = (1 - H_c H^{-1})^{-1} g_c, \qquad
@@ -101,6 +102,9 @@ _CORNERS = 6.0
 """Most that a turn or stretch moves the image's corners between those tried [pixels]."""
 _MOST = 41
 """Turns, and stretches, tried."""
+_LOOSE = 4.0
+_TURN_STEP, _GROWTH_STEP = float(np.radians(4.0)), 0.045
+"""Blur [pixels], steps of turn and growth where an image is sought that is not as predicted."""
 _CELL = 24
 """Side of cells whose speckle has nothing in common [pixels]."""
 _STIFF = 1e-5
@@ -351,7 +355,7 @@ class _Drawn:
 
 @dataclass(frozen=True)
 class _Peak:
-    """Of the search: shift (2,) of the image's middle, its turn, its growth, and what it is worth."""
+    """Of the search: shift (2,) of the image's middle, its turn, its growth, its chance."""
 
     shift: FloatArray
     turn: float
@@ -361,7 +365,7 @@ class _Peak:
 
 @dataclass(frozen=True)
 class _Aligned:
-    """Of the alignment: from the image to the drawn reference, and the shift's covariance (2, 2)."""
+    """From the image to the drawn reference, and the covariance (2, 2) of its shift."""
 
     transform: FloatArray
     covariance: FloatArray
@@ -398,6 +402,35 @@ def matched(
     if aligned is None:
         return refused("too little in it holds it in place", peak.chance)
     return _judged(image, drawn, predicted, peak, aligned, c)
+
+
+def misplaced(
+    image: Searchable, reference: Searchable, predicted: Prediction
+) -> tuple[float, float] | None:
+    """Turn [rad] and growth [-] with which an image is recognized that is not as predicted.
+
+    For a message: what a reference shows then does not belong to the places that it says. Turns all
+    around are tried and growths to a fifth; None if none of them stands out.
+    """
+    drawn = _drawn(image.shape, reference, predicted)
+    if drawn is None:
+        return None
+    a, b = (
+        np.ascontiguousarray(cv2.GaussianBlur(layers.coarse, (0, 0), _LOOSE)[::4, ::4])
+        for layers in (image.layers, drawn.layers)
+    )
+    if a.std() < 1e-6 or b.shape[0] < a.shape[0] or b.shape[1] < a.shape[1]:
+        return None
+    best: tuple[float, float, float] | None = None
+    for growth in np.arange(-4, 5) * _GROWTH_STEP:
+        for turn in np.arange(-45, 45) * _TURN_STEP:
+            surface = cv2.matchTemplate(b, _turned(a, turn, growth), cv2.TM_CCOEFF_NORMED)
+            found = _standing_out(np.asarray(surface, np.float32), np.ones(surface.shape, np.bool_))
+            if found is not None and (best is None or found[2] < best[0]):
+                best = found[2], float(turn), float(growth)
+    if best is None or best[0] > _CHANCE:
+        return None
+    return best[1], best[2]
 
 
 def refused(reason: str, chance: float = 1.0) -> Match:
@@ -499,7 +532,8 @@ def _drawn(shape: tuple[int, int], reference: Searchable, predicted: Prediction)
 
 def _inside(place: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Which places (..., 2) are on an image of a shape."""
-    return np.all((place >= 0) & (place <= np.array(shape) - 1), axis=-1)
+    low, high = place.min(axis=-1) >= 0, (place <= np.array(shape) - 1).all(axis=-1)
+    return np.asarray(low & high, np.bool_)
 
 
 def _averaged(amplitude: Single, predicted: Prediction, shape: tuple[int, int]) -> Single:
@@ -560,7 +594,8 @@ def _searched(image: Searchable, drawn: _Drawn, predicted: Prediction) -> _Peak 
         return None
     i, j, chance = found
     at = _vertex(best, i, j) * _STEP + drawn.first
-    return _Peak(at, *tried[which[i, j]], chance)
+    turn, growth = tried[which[i, j]]
+    return _Peak(at, float(turn), float(growth), chance)
 
 
 def _turned(a: Single, turn: float, growth: float) -> Single:
@@ -583,9 +618,13 @@ def _allowed(shifts: list[FloatArray], covariance: FloatArray) -> NDArray[np.boo
     return np.asarray(square <= _SIGMAS**2)
 
 
+<<<<<<< HEAD
 def _standing_out(
     surface: Single, allowed: NDArray[np.bool_], drawn: Single, shape: tuple[int, ...]
 ) -> tuple[int, int, float] | None:
+=======
+def _standing_out(surface: Single, allowed: NDArray[np.bool_]) -> tuple[int, int, float] | None:
+>>>>>>> fix
     """The highest allowed peak, and the chance that a wrong one stands out as much."""
     where = np.where(allowed, surface, -np.inf)
     i, j = (int(k) for k in np.unravel_index(where.argmax(), where.shape))

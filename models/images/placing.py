@@ -14,7 +14,9 @@ the terrain has
 
 with :math:`a, c` along the track and across it, and :math:`w` how the place moves where the terrain
 is higher than known: up, and in slant geometry towards the radar of the reference, for what was
-seen at a range is nearer if it is higher.
+seen at a range is nearer if it is higher. A reference of level ground, or of few tie points, does
+not tell whether it is in slant geometry: then up and across are taken each by itself, which holds
+in either.
 """
 
 from __future__ import annotations
@@ -114,10 +116,11 @@ def predicted(
         low, high = searched_span(n, float(np.sqrt(variance)))
         count = int(np.clip(np.ceil((high - low) / _SPACING) + 1, 2, _MOST_NODES))
         axes.append(np.linspace(low, high, count))
-    latitude, longitude, height = _on_terrain(view, *axes, terrain)
+    rows, columns = axes
+    latitude, longitude, height = _on_terrain(view, rows, columns, terrain)
     row, column, inside = reference.pixel(latitude, longitude, height)
     places = _smooth(np.stack([row, column], axis=-1), inside)
-    return Prediction(axes[0], axes[1], places, covariance, linear)
+    return Prediction(rows, columns, places, covariance, linear)
 
 
 def _smooth(places: FloatArray, inside: NDArray[np.bool_]) -> FloatArray:
@@ -200,7 +203,7 @@ def _on_terrain(
 
 
 def placed(
-    reference: Reference, terrain: Height, match: Match, v: FloatArray, sigma: FloatArray
+    reference: Reference, terrain: Height, match: Match, view: View, sigma: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Place (3,) [m] of a match on the terrain, and the covariance (3, 3) [m^2] of its error.
 
@@ -210,8 +213,8 @@ def placed(
     terrain : callable
         Height [m] at latitudes and longitudes [rad].
     match : Match
-    v : ndarray, shape (3,)
-        Velocity of who sees it [m/s], Earth-fixed.
+    view : View
+        Of who sees it.
     sigma : ndarray, shape (3,)
         Errors of the reference's places along the track and across it, and of its heights [m].
 
@@ -236,9 +239,15 @@ def placed(
             pixel[k] = np.clip(pixel[k] + sign * _PIXELS, knots[0], knots[-1])
             ends.append((pixel[k], at(*pixel)))
         J[:, k] = (ends[0][1] - ends[1][1]) / (ends[0][0] - ends[1][0])
-    w = (at(match.row, match.column, _RISE) - at(match.row, match.column, -_RISE)) / (2 * _RISE)
-    along, across, _ = track_axes(p, v)
+    along, across, up = track_axes(p, view.v)
     D = J @ match.covariance @ J.T
-    for s, u in zip(sigma, (along, across, w), strict=True):
+    axes = [(sigma[0], along), (sigma[1], across)]
+    if reference.tells_heights:
+        raised, lowered = (at(match.row, match.column, s * _RISE) for s in (1, -1))
+        axes.append((sigma[2], (raised - lowered) / (2 * _RISE)))
+    else:
+        one_range = np.cross(view.v, view.r - p)
+        axes += [(sigma[2], up), (sigma[2], one_range / float(one_range @ up) - up)]
+    for s, u in axes:
         D += s * s * np.outer(u, u)
     return p, D

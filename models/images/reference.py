@@ -33,6 +33,9 @@ _FEWEST_TIES, _MOST_TIES = 8, 65
 _NO_POLYNOMIAL = 0.5
 """Distance of a tie point from it beyond which it is not used [m]."""
 
+_RELIEF = 3.0
+"""Standard deviation of heights that tell how places move with height [m]."""
+
 KEYS = ("amplitude", "rows", "columns", "latitude_deg", "longitude_deg", "height_m")
 _TURN = 2 * np.pi
 _WIDEST = float(np.radians(30.0))
@@ -152,6 +155,11 @@ class Reference:
                     return float(found[0]), float(found[1]), h
                 h += 0.7 * rise
         return latitude, longitude, float(terrain(np.array(latitude), np.array(longitude)))
+
+    @property
+    def tells_heights(self) -> bool:
+        """Whether tie points tell how places move with height: they have heights that differ."""
+        return self._by_height is not None and float(self.height.std()) > _RELIEF
 
     def _terms(self, row: FloatArray, column: FloatArray, height: FloatArray) -> FloatArray:
         """Terms (..., 15) of the polynomial of row, column and height, in ranges about one."""

@@ -180,6 +180,7 @@ def test_a_rendered_reference_errs_as_it_is_said_to():
 def believing(**settings):
     """An image former whose member believes the truth, with variances of 1 to 9."""
     acquired = SimpleNamespace(
+        time_sigma=np.zeros(1),
         beam_range=np.array([861013.0]),
         beam_doppler=np.array([54.0]),
         side=np.ones(1),
@@ -230,7 +231,7 @@ def test_the_error_of_the_autofocus_is_part_of_the_velocitys(monkeypatch, accept
     }
     focus = SimpleNamespace(velocity=7101.0, sigma=0.4, accepted=accepted)
     imager = SimpleNamespace(
-        radar=SimpleNamespace(wavelength=WAVELENGTH, prf=2160.0),
+        radar=SimpleNamespace(wavelength=WAVELENGTH, prf=2160.0, range_spacing=9.37),
         fraction=0.0,
         step=1.0,
         processing=lambda f, *_: f,
@@ -245,6 +246,8 @@ def test_the_error_of_the_autofocus_is_part_of_the_velocitys(monkeypatch, accept
     own = former._expected_velocity(0, WAVELENGTH)[0]
     assert sent["velocity"][0] == (7101.0 if accepted else round(own))
     assert sent["slant_range"][0] == 861013.0
+    assert sent["row_time"][0] == pytest.approx(2 / 2160)
+    assert sent["column_range"][0] == 9.37
     speed = np.linalg.norm(V_E)
     assert sent["sine"][0] == pytest.approx(WAVELENGTH * 54.0 / (2 * speed), rel=1e-12)
 

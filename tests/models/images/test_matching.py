@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from terrafix.models.images.matching import REASONS, Prediction, Searchable, matched
+from terrafix.models.images.matching import REASONS, Prediction, Searchable, matched, misplaced
 from terrafix.models.radar.autofocus import SharpnessCurve, autofocus
 from terrafix.models.radar.doppler import fractional_centroid, unwrapped_centroid
 from terrafix.models.radar.focusing import azimuth_looks, range_doppler
@@ -69,7 +69,9 @@ def test_a_turned_and_scaled_chip_is_found(scene, angle, scale):
     mean, reference, rng = scene
     center = (310.3, 287.6)
     chip = speckled(cut(mean, center, SIZE, angle, scale).astype(np.float64), rng)
-    match = matched(Searchable(chip), reference, expected(center, off=(9, -7), turn=0.1, growth=0.03))
+    match = matched(
+        Searchable(chip), reference, expected(center, off=(9, -7), turn=0.1, growth=0.03)
+    )
     assert match.reason == "accepted"
     assert (match.row, match.column) == pytest.approx(center, abs=0.4)
     assert match.shift == pytest.approx([-9, 7], abs=0.4)
@@ -155,7 +157,7 @@ def test_a_correlated_prediction_searches_along_its_long_axis(scene):
 
 
 def test_a_stretch_that_the_orbit_leaves_open_does_not_move_the_center(scene):
-    """Rows 0.4 % too long, as a wrong velocity has them, move what lies off the middle by 0.4 px."""
+    """Rows 0.4 % too long, as a wrong velocity has them, move what is off the middle by 0.4 px."""
     mean, reference, rng = scene
     center = np.array([300.0, 300.0])
     A = np.array([[1, 0, 0], [0, 1.004, 300 * (1 - 1.004)]])  # x, y: of rows alone
@@ -176,7 +178,9 @@ def test_a_stretch_that_the_orbit_leaves_open_does_not_move_the_center(scene):
 def test_another_point_than_the_middle_can_be_asked_for(scene):
     mean, reference, rng = scene
     chip = Searchable(speckled(cut(mean, (300, 300), SIZE).astype(np.float64), rng))
-    middle, corner = (matched(chip, reference, expected((300, 300)), c) for c in (None, (20.0, 40.0)))
+    middle, corner = (
+        matched(chip, reference, expected((300, 300)), c) for c in (None, (20.0, 40.0))
+    )
     assert corner.row - middle.row == pytest.approx(20 - 127.5, abs=0.5)
     assert corner.column - middle.column == pytest.approx(40 - 127.5, abs=0.5)
     assert np.linalg.det(corner.covariance) > np.linalg.det(middle.covariance)
@@ -231,7 +235,7 @@ def test_the_chance_of_a_wrong_place_is_no_smaller_than_it_says(scene):
         matched(Searchable(speckled(np.ones((128, 128)), rng)), reference, where).chance
         for _ in range(40)
     ]
-    assert 1e-4 < min(chances)
+    assert min(chances) > 1e-4
     assert np.sum(np.array(chances) < 0.25) <= 18
     assert min(chances) < 0.5
 
@@ -401,3 +405,15 @@ def test_disjoint_looks_of_real_echo_are_matched(points, name):
     errors -= np.sum(errors / sigmas**2, axis=0) / np.sum(1 / sigmas**2, axis=0)
     assert 0.3 < np.sqrt(np.mean((errors[:, 1] / sigmas[:, 1]) ** 2)) < 1.6
     assert np.sqrt(np.mean((errors[:, 0] / sigmas[:, 0]) ** 2)) < 2.0
+
+
+@pytest.mark.parametrize(("angle", "scale"), [(45.0, 1.0), (0.0, 1.1)])
+def test_a_reference_that_shows_it_turned_or_of_other_spacing_is_told_by_which(scene, angle, scale):
+    mean, reference, rng = scene
+    chip = Searchable(speckled(cut(mean, (300, 300), SIZE, angle, scale).astype(np.float64), rng))
+    where = expected((300, 300), sigma=10.0)
+    assert not matched(chip, reference, where).accepted
+    turn, growth = misplaced(chip, reference, where)
+    assert abs(np.degrees(turn)) == pytest.approx(angle, abs=4.0)
+    assert growth == pytest.approx(1 / scale - 1, abs=0.05)
+    assert misplaced(Searchable(speckled(np.ones((SIZE, SIZE)), rng)), reference, where) is None

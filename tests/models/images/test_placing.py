@@ -1,0 +1,182 @@
+"""Where an orbit predicts an image on a reference, and the place and covariance of a match."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrafix.models.geometry.geodesy import ecef, geodetic
+from terrafix.models.geometry.geolocation import track_axes
+from terrafix.models.images.matching import Match
+from terrafix.models.images.placing import View, placed, predicted
+from terrafix.models.images.reference import Reference
+
+SHAPE = (480, 600)
+R_E = np.array([-1104646.34, -6096830.39, 3395727.38])
+V_E = np.array([-112.0, 3806.0, 6497.9])
+VIEW = View(R_E, V_E, 200.5, 299.9, 2 / 2160, 861e3, 9.37, 9e-4)
+
+
+def hills(latitude, longitude):
+    """300 m of relief over some kilometers."""
+    return 150 * (1 + np.sin(latitude * 6371 / 1.3) * np.cos(longitude * 5500 / 1.7))
+
+
+def flat(latitude, longitude):
+    return 0 * latitude
+
+
+def reference(view, terrain=hills, margin=600, n=49):
+    """What a view sees, as a reference in its own geometry: its row 0 is row -margin of it."""
+    ties = [np.linspace(0, k + 2 * margin - 1, n) for k in SHAPE]
+    rows, columns = (t - margin for t in ties)
+    h = np.zeros((n, n))
+    for _ in range(60):
+        latitude, longitude, _ = geodetic(view.points(rows, columns, h))
+        h = h + 0.6 * (terrain(latitude, longitude) - h)
+    amplitude = np.ones([k + 2 * margin for k in SHAPE], np.float32)
+    return Reference(amplitude, ties[0], ties[1], latitude, longitude, h)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return reference(VIEW)
+
+
+def test_an_orbit_that_is_right_predicts_every_pixel(known):
+    """On hills, between tie points: 0.05 pixels."""
+    where = predicted(VIEW, np.zeros((6, 6)), known, hills, SHAPE)
+    rows, columns = np.array([0.0, 200.5, 479.0]), np.array([0.0, 299.9, 599.0])
+    true = np.stack(np.meshgrid(rows + 600, columns + 600, indexing="ij"), axis=-1)
+    np.testing.assert_allclose(where.at(rows, columns), true, atol=0.05)
+    np.testing.assert_allclose(where.slope(200.5, 299.9), np.eye(2), atol=1e-3)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_an_orbit_that_is_wrong_is_off_by_what_its_covariance_says(side):
+    """40 orbits off by 300 m and 3 m/s: normalized squares of the shift have mean 2, of the four
+    elements of the linear map 4; 3 sigma of their means either way."""
+    view = replace(VIEW, side=side)
+    known = reference(view, flat, n=9)
+    P = np.diag([300.0**2] * 3 + [3.0**2] * 3)
+    rng = np.random.default_rng(3)
+    shifts, slopes = [], []
+    for _ in range(40):
+        off = np.sqrt(np.diag(P)) * rng.standard_normal(6)
+        v = V_E + off[3:]
+        sine = view.sine * np.linalg.norm(V_E) / np.linalg.norm(v)
+        other = replace(view, r=R_E + off[:3], v=v, sine=sine)
+        where = predicted(other, P, known, flat, SHAPE)
+        # the true center is where the prediction puts center + shift
+        A = where.slope(200.5, 299.9)
+        shift = np.linalg.solve(A, [800.5, 899.9] - where.at([200.5], [299.9])[0, 0])
+        shifts.append(shift @ np.linalg.solve(where.covariance, shift))
+        linear = (np.linalg.inv(A) - np.eye(2)).ravel()
+        slopes.append(linear @ np.linalg.solve(where.linear, linear))
+    assert np.mean(shifts) == pytest.approx(2.0, abs=3 * np.sqrt(4 / 40))
+    assert np.mean(slopes) < 4 + 3 * np.sqrt(8 / 40)  # with what tie points may have wrong: less
+
+
+def test_time_and_range_are_in_the_shift(known):
+    """1 ms is 1.08 rows of 2 / 2160 s, and 18.7 m are two columns of 9.37 m."""
+    unsure = replace(VIEW, time_sigma=1e-3, range_sigma=18.74)
+    where = predicted(unsure, np.zeros((6, 6)), known, hills, SHAPE)
+    np.testing.assert_allclose(np.sqrt(np.diag(where.covariance)), [1.08, 2.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "mutation", [{"row_time": -2 / 2160}, {"column_range": -9.37}, {"side": -1}]
+)
+def test_a_sign_that_is_wrong_is_seen_in_what_is_predicted(known, mutation):
+    where = predicted(replace(VIEW, **mutation), np.zeros((6, 6)), known, hills, SHAPE)
+    corner = where.at([0.0], [0.0])[0, 0]
+    assert np.abs(corner - 600).max() > 300
+
+
+def test_what_sees_no_ground_is_refused(known):
+    with pytest.raises(ValueError, match="do not all reach the ground"):
+        predicted(replace(VIEW, r=4 * R_E), np.eye(6), known, hills, SHAPE)
+
+
+@pytest.mark.parametrize("longitude", [-np.pi, 0.3])
+def test_it_goes_on_across_the_date_line(longitude):
+    """The same pass turned about the Earth's axis, tie points on both sides of 180 degrees."""
+    c, s = np.cos(longitude), np.sin(longitude)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    _, own, _ = geodetic(VIEW.points(np.array([200.5]), np.array([299.9]), np.zeros((1, 1))))
+    back = np.array(
+        [
+            [np.cos(own[0, 0]), np.sin(own[0, 0]), 0],
+            [-np.sin(own[0, 0]), np.cos(own[0, 0]), 0],
+            [0, 0, 1],
+        ]
+    )
+    view = replace(VIEW, r=turn @ back @ R_E, v=turn @ back @ V_E)
+    ties = reference(view, flat, n=9)
+    wrapped = replace(ties, longitude=np.angle(np.exp(1j * ties.longitude)))
+    where = predicted(view, np.zeros((6, 6)), wrapped, flat, SHAPE)
+    np.testing.assert_allclose(where.at([200.5], [299.9])[0, 0], [800.5, 899.9], atol=0.05)
+
+
+def match_at(row, column, covariance):
+    return Match(row, column, np.asarray(covariance, float), True, "accepted")
+
+
+def test_the_covariance_of_a_place_is_that_of_pixels_reference_and_heights(known):
+    """On level ground at 38.7 deg: rows of 6.3 m along, columns of 9.37 m / sin(incidence) across,
+    and a height that is off by 1 m moves the place by 1 / tan(incidence) m towards the radar."""
+    level = reference(VIEW, flat, n=9)
+    match = match_at(800.5, 899.9, np.diag([0.2**2, 0.1**2]))
+    p, D = placed(level, flat, match, VIEW, np.zeros(3))
+    true = VIEW.points(np.array([200.5]), np.array([299.9]), np.zeros((1, 1)))[0, 0]
+    np.testing.assert_allclose(p, true, atol=0.02)
+    axes = track_axes(p, V_E)
+    line = (R_E - p) / np.linalg.norm(R_E - p)
+    incidence = np.arccos(axes[2] @ line)
+    own = axes @ D @ axes.T
+    row = np.linalg.norm(
+        np.diff(VIEW.points(np.array([200.0, 201.0]), np.array([299.9]), np.zeros((2, 1))), axis=0)
+    )
+    np.testing.assert_allclose(np.sqrt(own[0, 0]), 0.2 * row, rtol=0.01)
+    np.testing.assert_allclose(np.sqrt(own[1, 1]), 0.1 * 9.37 / np.sin(incidence), rtol=0.01)
+    assert abs(own[2, 2]) < 1e-4
+    datum = (
+        axes
+        @ placed(
+            level, flat, match_at(800.5, 899.9, np.zeros((2, 2))), VIEW, np.array([0, 0, 30.0])
+        )[1]
+        @ axes.T
+    )
+    np.testing.assert_allclose(np.sqrt(datum[2, 2]), 30.0, rtol=0.01)
+    np.testing.assert_allclose(np.sqrt(datum[1, 1]), 30.0 / np.tan(incidence), rtol=0.02)
+    assert abs(datum[1, 2]) < 1e-6
+
+
+@pytest.mark.parametrize("terrain", [hills, flat])
+def test_a_map_30_m_low_is_within_a_sigma_of_30_m(terrain):
+    """Its place is 48 m off on level ground, with one height for reference and image."""
+
+    def lower(latitude, longitude):
+        return terrain(latitude, longitude) - 30.0
+
+    row, column = np.array([200.5]), np.array([299.9])
+    height = np.zeros((1, 1))
+    for _ in range(60):
+        true = VIEW.points(row, column, height)
+        height = height + 0.5 * (terrain(*geodetic(true)[:2]) - height)
+    match = match_at(800.5, 899.9, np.diag([0.05**2, 0.05**2]))
+    p, D = placed(reference(VIEW, lower), lower, match, VIEW, np.array([0.1, 0.1, 30.0]))
+    miss = true[0, 0] - p
+    assert 30 < np.linalg.norm(miss) < 90
+    assert miss @ np.linalg.solve(D, miss) < 2.1
+
+
+def test_errors_of_places_are_along_and_across(known):
+    p, D = placed(
+        known, hills, match_at(800.5, 899.9, np.zeros((2, 2))), VIEW, np.array([2.0, 3.0, 0.0])
+    )
+    own = track_axes(p, V_E) @ D @ track_axes(p, V_E).T
+    np.testing.assert_allclose(own, np.diag([4.0, 9.0, 0.0]), atol=1e-6)
+    _, longitude, height = geodetic(p)
+    assert height == pytest.approx(hills(geodetic(p)[0], longitude), abs=0.05)
+    assert np.linalg.norm(ecef(*geodetic(p)) - p) < 1e-3
