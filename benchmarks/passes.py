@@ -11,7 +11,12 @@ import numpy as np
 
 from terrafix.models.core.arrays import FloatArray, Single
 from terrafix.models.geometry.ground import EllipsoidGround
+<<<<<<< HEAD
+from terrafix.models.images.matching import Match, Searchable, matched
+from terrafix.models.images.placing import View, predicted
+=======
 from terrafix.models.images.matching import Match, Prediction, Searchable, matched
+>>>>>>> fix
 from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import Dem
 from terrafix.models.motion.arc import OrbitArc
@@ -24,6 +29,8 @@ from terrafix.models.radar.scene import Scene
 PALSAR = Radar(1269.768992e6, 2160.0, 16e6, -14e6 / 27e-6, 27e-6, 1513.0)
 EARTH = EllipsoidGround()
 LOOKS = (2, 1)
+PRIOR, PRIOR_SPEED = 300.0, 1.0
+"""Standard errors of position [m] and velocity [m/s] along each axis, in searching."""
 SPEED = 7599.0
 """Earth-fixed [m/s]."""
 HEADING, INCIDENCE = float(np.radians(-10.0)), float(np.radians(38.7))
@@ -89,6 +96,8 @@ class Seen:
     Parameters
     ----------
     amplitude : ndarray of float32, shape (n_rows, n_columns)
+    grid : Footprint
+        Of it before looks were averaged.
     reference : Reference
         The same, geocoded with the true terrain.
     middle : tuple of float
@@ -98,6 +107,7 @@ class Seen:
     """
 
     amplitude: Single
+    grid: Footprint
     reference: Reference
     middle: tuple[float, float]
     place: FloatArray
@@ -119,9 +129,38 @@ def seen(scene: Scene, grid: Footprint, rng: np.random.Generator, snr_db: float 
         latitude, longitude, _ = EARTH.geodetic(grid.points(t, R, np.array(height)))
         height += 0.5 * (float(scene.dem.at(latitude, longitude)) - height)
     place = np.array([float(latitude), float(longitude), height])
-    return Seen(amplitude, reference, (row, column), place)
+    return Seen(amplitude, grid, reference, (row, column), place)
 
 
+<<<<<<< HEAD
+def found(image: Seen, reference: Reference, dem: Dem, rng: np.random.Generator) -> Match:
+    """Where the matcher finds an image on a reference, by an orbit that errs.
+
+    Parameters
+    ----------
+    image : Seen
+    reference : Reference
+    dem : Dem
+        The terrain as it is known.
+    rng : numpy.random.Generator
+        Of the orbit's error.
+    """
+    grid, (row, column) = image.grid, image.middle
+    line, cell = (full_index(k, n) for k, n in zip((row, column), LOOKS, strict=True))
+    t = grid.first_time + line / PALSAR.prf
+    view = View(
+        grid.arc.position(t) + PRIOR * rng.standard_normal(3),
+        grid.arc.velocity(t) + PRIOR_SPEED * rng.standard_normal(3),
+        *(row, column, LOOKS[0] / PALSAR.prf),
+        *(float(grid.near_range + cell * PALSAR.range_spacing), PALSAR.range_spacing * LOOKS[1]),
+        sine=0.0,
+    )
+    P = np.diag(np.repeat([PRIOR**2, PRIOR_SPEED**2], 3))
+    where = predicted(view, P, reference, dem.known_at, image.amplitude.shape)
+    return matched(
+        Searchable(image.amplitude), Searchable(reference.amplitude), where, image.middle
+    )
+=======
 PRIOR, LINEAR = 60.0, 2e-3
 """Sigmas of an orbit that is 1 km off: of an image's shift [pixels], and of a linear map of it."""
 
@@ -139,3 +178,4 @@ def found(image: Seen, reference: Reference) -> Match:
     )
     one, other = (Searchable(a) for a in (image.amplitude, reference.amplitude))
     return matched(one, other, where, image.middle)
+>>>>>>> fix

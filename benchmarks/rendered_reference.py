@@ -5,7 +5,8 @@
 Every image has a place, a surface, speckle and an orbit of its own; what is known of the terrain,
 of each class's brightness and of where both lie errs anew. Printed are the share that is
 recognized, the errors of what was accepted, in pixels of the reference and in meters on the ground,
-and their standard errors as `place_sigma` tells them.
+what map and heights alone account for, and the mean square of errors normalized by the covariance
+of the fix.
 """
 
 from __future__ import annotations
@@ -13,22 +14,28 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from passes import EARTH, HEADING, INCIDENCE, LOOKS, footprint, found, seen
 
-from terrafix.models.images.rendered_reference import place_sigma, rendered
-from terrafix.models.maps.dem import Dem, read_jacksboro, roughened
+from terrafix.models.geometry.geolocation import track_axes
+from terrafix.models.images.placing import placed
+from terrafix.models.images.rendered_reference import rendered
+from terrafix.models.maps.dem import Dem, read_dem, read_jacksboro, roughened
 from terrafix.models.radar.scene import CoverMap, Scene
 
 SIZE, AROUND = (480, 600), (1000, 1100)
 """Rows and columns of images and of references."""
+AREA = np.array([[25.0, -100.0], [45.0, -60.0]])
+"""Latitudes and longitudes of places [deg]."""
 
 
 def trial(number: int, dem: Dem, options: argparse.Namespace) -> dict[str, object]:
     """One image."""
     rng = np.random.default_rng([20191, number])
-    place = np.radians(rng.uniform([25.0, -100.0], [45.0, -60.0]))
+    place = np.radians(rng.uniform(*options.area))
     seed = int(rng.integers(2**31))
     turn = HEADING + np.pi * rng.integers(2)  # ascending or descending
     true = footprint(dem, place, SIZE, heading=turn)
@@ -36,35 +43,32 @@ def trial(number: int, dem: Dem, options: argparse.Namespace) -> dict[str, objec
     known = dem
     if options.height:
         known = roughened(dem, options.height, options.length, number)
+    datum = options.datum * float(rng.standard_normal())
+    known = replace(known, height=known.height + np.float32(datum))
     cover = CoverMap(
         known, seed=seed, cover=options.cover, class_sigma=options.brightness, map_seed=number
     )
     if not options.classes:
         cover = CoverMap(known, cover="texture")
     displaced = options.placing * rng.standard_normal(2)
-    # the orbit that is expected is 1 km off, in heading and incidence by what that makes
-    off = 1000.0 * rng.standard_normal(2) / EARTH_RADIUS
-    planned = footprint(known, place + off, AROUND, heading=turn, off=600 * rng.standard_normal(3))
+    # what is rendered is for an orbit some kilometer off
+    off = 600.0 * rng.standard_normal(3)
+    planned = footprint(known, place, AROUND, heading=turn, off=off)
     reference = rendered(cover, planned, LOOKS, displaced=tuple(displaced))
-    match = found(image, reference)
+    match = found(image, reference, known, rng)
     row, column, inside = reference.pixel(image.place[0], image.place[1])
     out = {"accepted": match.accepted, "reason": match.reason, "inside": bool(inside)}
     if match.accepted:
-        latitude, longitude, _ = reference.place(match.row, match.column)
-        height = float(known.at(latitude, longitude))
-        true_p = EARTH.point(*image.place)
-        north, east, down = EARTH.axes(true_p)
-        off_m = EARTH.point(latitude, longitude, height) - true_p
-        n, e, d = (float(off_m @ a) for a in (north, east, down))
-        ahead = np.array([np.cos(turn), np.sin(turn)])
-        right = np.array([-np.sin(turn), np.cos(turn)])
+        across = np.hypot(options.placing, options.datum / np.tan(INCIDENCE))
+        up = np.hypot(options.height, options.datum)
+        sigma = np.array([options.placing, across, up])
+        velocity = true.arc.velocity(0.0)
+        p, D = placed(reference, known.at, match, velocity, sigma)
+        error = p - EARTH.point(*image.place)
         out["pixels"] = (match.row - float(row), match.column - float(column))
-        out["meters"] = (ahead @ [n, e], right @ [n, e], -d)
-        out["sigma"] = match.sigma
+        out["meters"] = track_axes(p, velocity) @ error
+        out["square"] = error @ np.linalg.solve(D, error)
     return out
-
-
-EARTH_RADIUS = 6371e3
 
 
 def main() -> None:
@@ -78,8 +82,15 @@ def main() -> None:
     parser.add_argument("--classes", type=int, default=1, help="0: relief alone")
     parser.add_argument("--brightness", type=float, default=1.5, help="error of classes [dB]")
     parser.add_argument("--placing", type=float, default=3.0, help="error of places [m]")
+    parser.add_argument("--datum", type=float, default=0.0, help="error of all heights [m]")
+    parser.add_argument("--tile", type=Path, help="another elevation model, a degree square")
     options = parser.parse_args()
     start, dem = time.process_time(), read_jacksboro().tiled()
+    options.area = AREA
+    if options.tile:
+        dem = read_dem(options.tile)
+        middle = [float(np.degrees(sum(dem._span(k)) / 2)) for k in (0, 1)]
+        options.area = np.add(middle, [[-0.3, -0.25], [0.3, 0.25]])
     outcomes = [
         trial(k, dem, options) for k in range(options.first, options.first + options.images)
     ]
@@ -94,7 +105,10 @@ def main() -> None:
     for name, values in (("pixels", pixels), ("meters", meters)):
         rms = np.sqrt((values**2).mean(axis=0))
         print(f"{name}: mean {values.mean(axis=0).round(2)}, rms {rms.round(2)}")
-    print("expected of map and heights", place_sigma(INCIDENCE, options.placing, options.height, 0))
+    print(f"normalized square of the errors: {np.mean([o['square'] for o in right]):.2f} of 3")
+    across = np.hypot(options.placing, options.height / np.tan(INCIDENCE))
+    up = np.hypot(options.height, options.datum)
+    print(f"of map and heights alone: {options.placing:.2f}, {across:.2f}, {up:.2f} m")
 
 
 if __name__ == "__main__":

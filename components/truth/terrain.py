@@ -166,13 +166,13 @@ class Terrain(Component):
         """Whether a setting has any effect: heights of hills have where there are hills."""
         if name in _UNREAD.get(self.setting("cover"), ()):
             return False
-        hills = self.setting("source") == "hills"
+        hills = bool(self.setting("source") == "hills")
         if name in _OF_HILLS:
             return hills
         if name == "error":
             return bool(self.setting("source") != "flat")
         if name in _OF_ERRORS:
-            return self.takes("error") and float(self.setting("error")) > 0
+            return self.takes("error") and bool(float(self.setting("error")) > 0)
         if name in _OF_FILES:
             stated = name == "geoid" and self.setting("vertical_datum") == ELLIPSOID
             return self.setting("source") == "file" and not stated
@@ -243,7 +243,11 @@ def referred(component: Component, dem: Dem) -> Dem:
 
 def scene_from(height: Single, grid: FloatArray, surface: FloatArray) -> Scene:
     """What the ground looks like to a radar, from the ports of a terrain."""
-    seed, *strengths, detail, cover = (float(s) for s in surface)
+    seed, parcels, smooth, fine, density, brightness, detail, cover = (float(s) for s in surface)
     return Scene(
-        dem_from(height, grid), int(seed), *strengths, detail=int(detail), cover=COVERS[int(cover)]
+        dem_from(height, grid),
+        int(seed),
+        *(parcels, smooth, fine, density, brightness),
+        detail=int(detail),
+        cover=COVERS[int(cover)],
     )

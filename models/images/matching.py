@@ -13,7 +13,10 @@ fall off like those of a Gaussian field, so of the squares of wrong ones in fall
 :math:`E_1 > E_2 > \dots` the spacings :math:`i (E_i - E_{i+1})` are independent and exponential
 with one mean [1]_. How much the first stands out of those after it has an F distribution, and the
 chance of a wrong one that stands out as much follows, for any number of shifts searched. Besides,
-the peak must be found again in several parts of the image, each by itself.
+the peak must be found again in several parts of the image, each by itself. Around the right peak
+the reference resembles itself, along ridges and streets: what its own correlation explains is no wrong
+peak, but a place that is half alike counts by how likely it is, :math:`e^{-\rho (\rho - \rho_k) /
+\sigma^2}` with :math:`\sigma` the noise of correlation.
 
 **How far it is off.** Near the peak the shift of the image and a linear map about its center,
 :math:`\theta`, follow from the score of correlation,
@@ -87,6 +90,8 @@ _SEEN = 0.8
 """Share of the image that must lie on the reference."""
 _LOBE = 6
 """Half the side of a peak: no other is counted there [searched pixels]."""
+_ALIKE = 0.5
+"""Correlation of a reference with itself, from which on two places resemble each other."""
 _SPACINGS = 16
 """Peaks that the first one is held against."""
 _AMBIGUOUS = 1e-3
@@ -584,7 +589,7 @@ def _searched(image: Searchable, drawn: _Drawn, predicted: Prediction) -> _Peak 
         best[higher], which[higher] = surface[higher], k
     best[(seen < _SEEN) | ~np.isfinite(best)] = 0.0
     shifts = [np.arange(n) * float(_STEP) + f for n, f in zip(best.shape, drawn.first, strict=True)]
-    found = _standing_out(best, _allowed(shifts, predicted.covariance))
+    found = _standing_out(best, _allowed(shifts, predicted.covariance), b, a.shape)
     if found is None:
         return None
     i, j, chance = found
@@ -613,23 +618,48 @@ def _allowed(shifts: list[FloatArray], covariance: FloatArray) -> NDArray[np.boo
     return np.asarray(square <= _SIGMAS**2)
 
 
+<<<<<<< HEAD
+def _standing_out(
+    surface: Single, allowed: NDArray[np.bool_], drawn: Single, shape: tuple[int, ...]
+) -> tuple[int, int, float] | None:
+=======
 def _standing_out(surface: Single, allowed: NDArray[np.bool_]) -> tuple[int, int, float] | None:
+>>>>>>> fix
     """The highest allowed peak, and the chance that a wrong one stands out as much."""
     where = np.where(allowed, surface, -np.inf)
     i, j = (int(k) for k in np.unravel_index(where.argmax(), where.shape))
     if not (0 < i < surface.shape[0] - 1 and 0 < j < surface.shape[1] - 1) or where[i, j] <= 0:
         return None
+    # what the reference has of itself about the peak is no other place
+    part = np.ascontiguousarray(drawn[i : i + shape[0], j : j + shape[1]])
+    alike = cv2.matchTemplate(drawn, part, cv2.TM_CCOEFF_NORMED)
+    alike[~np.isfinite(alike)] = 0.0
+    others = np.where(surface == 0, 0, surface - surface[i, j] * alike)
+    noise = float(others[surface != 0].std())
+    chance = _spaced_out(_elsewhere(others, i, j), float(surface[i, j]))
+    # how much likelier the place is than others that resemble it
+    again = _elsewhere(np.where(alike > _ALIKE, surface, 0), i, j)
+    ahead = float(surface[i, j]) * (float(surface[i, j]) - again) / max(noise, 1e-6) ** 2
+    return i, j, min(chance + float(np.exp(-np.clip(ahead, 0, 700)).sum()), 1.0)
+
+
+def _elsewhere(surface: Single, i: int, j: int) -> FloatArray:
+    """Peaks but the one at a place, the highest first."""
     side = np.ones((2 * _LOBE + 1, 2 * _LOBE + 1), np.uint8)
     highest = (surface >= cv2.dilate(surface, side)) & (surface > 0)
     highest[max(i - _LOBE, 0) : i + _LOBE + 1, max(j - _LOBE, 0) : j + _LOBE + 1] = False
-    tops = surface[highest]
-    E = np.sort(tops)[::-1][: _SPACINGS + 1].astype(np.float64) ** 2
+    return np.sort(surface[highest])[::-1].astype(np.float64)
+
+
+def _spaced_out(others: FloatArray, peak: float) -> float:
+    """Chance that the highest of wrong peaks stands out so much."""
+    E = others[: _SPACINGS + 1] ** 2
     if len(E) < 3:
-        return None
+        return 1.0
     n = len(E) - 1
     mean = float(np.mean(np.arange(2, n + 2) * -np.diff(E)))
-    ahead = (float(surface[i, j]) ** 2 - E[0]) / max(mean, 1e-12)
-    return i, j, float((1 + max(ahead, 0.0) / n) ** -n)
+    ahead = (peak**2 - E[0]) / max(mean, 1e-12)
+    return float((1 + max(ahead, 0.0) / n) ** -n)
 
 
 def _vertex(surface: Single, i: int, j: int) -> FloatArray:

@@ -70,23 +70,3 @@ def _moved(
     north, east, _ = np.moveaxis(ground.axes(p), -2, 0)
     latitude, longitude, _ = ground.geodetic(p + displaced[0] * north + displaced[1] * east)
     return latitude, longitude
-
-
-def place_sigma(
-    incidence: float, placing: float, height_sigma: float, datum_sigma: float
-) -> FloatArray:
-    r"""Standard error of places of a rendered reference: along the track, across it, up (3,) [m].
-
-    Parameters
-    ----------
-    incidence : float
-        Of the radar on level ground [rad].
-    placing : float
-        Standard error of where map and elevation model lie, along each axis on the ground [m].
-    height_sigma : float
-        Of heights, of what differs from place to place within an image [m].
-    datum_sigma : float
-        Of heights, of what is common to an image [m].
-    """
-    across = np.hypot(placing, height_sigma / np.tan(incidence))
-    return np.array([placing, across, np.hypot(height_sigma, datum_sigma)])

@@ -75,8 +75,8 @@ class Districts:
 
 def words(seed: int, name: str, *parts: NDArray[np.int64] | Words | int) -> Words:
     """A random 64-bit number of every element of some whole numbers (SplitMix64)."""
-    start = np.random.SeedSequence([seed & 0xFFFFFFFF, *name.encode()]).generate_state(1, np.uint64)
-    out = start
+    start = np.random.SeedSequence([seed & 0xFFFFFFFF, *name.encode()])
+    out = np.asarray(start.generate_state(1, np.uint64), np.uint64)
     with np.errstate(over="ignore"):
         for part in parts:
             out = out ^ np.asarray(part).astype(np.uint64)
@@ -127,12 +127,12 @@ def districts(seed: int, rows: range, columns: range, cell: float) -> Districts:
         closer = distance < nearest[own]
         nearest[own][closer] = distance[closer]
         which[own][closer] = a * key.shape[1] + b
-    i0, j0, narrow, keys = (v.ravel()[which] for v in (i0, j0, narrow, key))
-    north = (np.asarray(rows)[:, None] - i0).astype(np.float32)
-    east = ((np.asarray(columns)[None, :] - j0) * narrow).astype(np.float32)
-    turn = 0.5 * np.pi * unit(keys, 2)
-    c, s = np.cos(turn).astype(np.float32), np.sin(turn).astype(np.float32)
-    return Districts(keys, c * east + s * north, c * north - s * east)
+    own_i, own_j, own_narrow = (v.ravel()[which] for v in (i0, j0, narrow))
+    north = (np.asarray(rows)[:, None] - own_i).astype(np.float32)
+    east = ((np.asarray(columns)[None, :] - own_j) * own_narrow).astype(np.float32)
+    turn = 0.5 * np.pi * unit(key, 2).ravel()
+    c, s = np.cos(turn).astype(np.float32)[which], np.sin(turn).astype(np.float32)[which]
+    return Districts(key.ravel()[which], c * east + s * north, c * north - s * east)
 
 
 def streets(at: Districts) -> tuple[NDArray[np.bool_], Words]:
@@ -178,4 +178,4 @@ def causeway(seed: int, rows: range, columns: range, cell: float) -> Single:
     width = _NARROW + (_WIDE - _NARROW) * unit(own)
     narrow = np.cos(np.asarray(rows) * cell)[:, None]
     distance = np.abs(u - line * _LINES) / np.hypot(1 / narrow, ahead)
-    return np.clip(width / 2 - distance + 0.5, 0.0, 1.0).astype(np.float32)
+    return np.asarray(np.clip(width / 2 - distance + 0.5, 0.0, 1.0), np.float32)

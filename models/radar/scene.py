@@ -325,7 +325,7 @@ class CoverMap(Scene):
         if self.cover == "fields":
             at = patterns.districts(self.seed, rows, columns, self.cell)
             kinds = patterns.crops(self.seed, patterns.fields(at))
-            return kinds, self.parcels_db * patterns.CROPS
+            return kinds, self.parcels_db * patterns.CROPS.astype(np.float64)
         ci, cj = _coarse_cells(rows, columns)
         kinds = np.zeros(shape, np.int64)
         for weight, name in ((2, "parcels a"), (1, "parcels b")):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrafix.models.geometry.geodesy import ecef
-from terrafix.models.images.rendered_reference import place_sigma, rendered
+from terrafix.models.images.rendered_reference import rendered
 from terrafix.models.maps.dem import flat_dem
 from terrafix.models.motion.arc import OrbitArc
 from terrafix.models.radar.chirp import Radar
@@ -82,9 +82,3 @@ def test_heights_that_are_off_move_what_is_rendered_in_range_alone(grid):
     assert row == pytest.approx(lines[12], abs=0.02)
     shift = -20.0 * np.cos(INCIDENCE) / PALSAR.range_spacing
     assert column - cells[25] == pytest.approx(shift, abs=0.02)
-
-
-def test_errors_of_heights_are_errors_of_places():
-    """At 45 deg a height is as far across as it is high; a datum is up alone."""
-    np.testing.assert_allclose(place_sigma(np.pi / 4, 3.0, 4.0, 0.0), [3.0, 5.0, 4.0])
-    np.testing.assert_allclose(place_sigma(np.pi / 4, 3.0, 0.0, 30.0), [3.0, 3.0, 30.0])
