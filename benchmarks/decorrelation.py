@@ -52,7 +52,7 @@ def trial(kind: str, what: str, level: float, number: int) -> tuple[bool, float]
         view[what] += np.radians(level) * rng.choice([-1, 1])
     now = Scene(dem, seed=seed, cover=cover, correlation=change, change_seed=seed + 1)
     image = seen(now, footprint(dem, place, SIZE, **view), rng)
-    match = found(image, earlier.reference, dem, rng)
+    match, _ = found(image, earlier.reference, dem, rng)
     if not match.accepted:
         return False, np.nan
     row, column, _ = earlier.reference.pixel(image.place[0], image.place[1])

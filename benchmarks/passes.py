@@ -11,12 +11,8 @@ import numpy as np
 
 from terrafix.models.core.arrays import FloatArray, Single
 from terrafix.models.geometry.ground import EllipsoidGround
-<<<<<<< HEAD
 from terrafix.models.images.matching import Match, Searchable, matched
 from terrafix.models.images.placing import View, predicted
-=======
-from terrafix.models.images.matching import Match, Prediction, Searchable, matched
->>>>>>> fix
 from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import Dem
 from terrafix.models.motion.arc import OrbitArc
@@ -132,9 +128,10 @@ def seen(scene: Scene, grid: Footprint, rng: np.random.Generator, snr_db: float 
     return Seen(amplitude, grid, reference, (row, column), place)
 
 
-<<<<<<< HEAD
-def found(image: Seen, reference: Reference, dem: Dem, rng: np.random.Generator) -> Match:
-    """Where the matcher finds an image on a reference, by an orbit that errs.
+def found(
+    image: Seen, reference: Reference, dem: Dem, rng: np.random.Generator
+) -> tuple[Match, View]:
+    """Where the matcher finds an image on a reference, and the orbit that errs by which it looks.
 
     Parameters
     ----------
@@ -157,25 +154,5 @@ def found(image: Seen, reference: Reference, dem: Dem, rng: np.random.Generator)
     )
     P = np.diag(np.repeat([PRIOR**2, PRIOR_SPEED**2], 3))
     where = predicted(view, P, reference, dem.known_at, image.amplitude.shape)
-    return matched(
-        Searchable(image.amplitude), Searchable(reference.amplitude), where, image.middle
-    )
-=======
-PRIOR, LINEAR = 60.0, 2e-3
-"""Sigmas of an orbit that is 1 km off: of an image's shift [pixels], and of a linear map of it."""
-
-
-def found(image: Seen, reference: Reference) -> Match:
-    """Where the matcher finds an image on a reference, as an orbit predicts it within 1 km."""
-    ties = image.reference
-    row, column, _ = reference.pixel(ties.latitude, ties.longitude, ties.height)
-    where = Prediction(
-        ties.rows,
-        ties.columns,
-        np.stack([row, column], axis=-1),
-        PRIOR**2 * np.eye(2),
-        LINEAR**2 * np.eye(4),
-    )
     one, other = (Searchable(a) for a in (image.amplitude, reference.amplitude))
-    return matched(one, other, where, image.middle)
->>>>>>> fix
+    return matched(one, other, where, image.middle), view

@@ -55,18 +55,17 @@ def trial(number: int, dem: Dem, options: argparse.Namespace) -> dict[str, objec
     off = 600.0 * rng.standard_normal(3)
     planned = footprint(known, place, AROUND, heading=turn, off=off)
     reference = rendered(cover, planned, LOOKS, displaced=tuple(displaced))
-    match = found(image, reference, known, rng)
+    match, view = found(image, reference, known, rng)
     row, column, inside = reference.pixel(image.place[0], image.place[1])
     out = {"accepted": match.accepted, "reason": match.reason, "inside": bool(inside)}
     if match.accepted:
         across = np.hypot(options.placing, options.datum / np.tan(INCIDENCE))
         up = np.hypot(options.height, options.datum)
         sigma = np.array([options.placing, across, up])
-        velocity = true.arc.velocity(0.0)
-        p, D = placed(reference, known.at, match, velocity, sigma)
+        p, D = placed(reference, known.at, match, view, sigma)
         error = p - EARTH.point(*image.place)
         out["pixels"] = (match.row - float(row), match.column - float(column))
-        out["meters"] = track_axes(p, velocity) @ error
+        out["meters"] = track_axes(p, view.v) @ error
         out["square"] = error @ np.linalg.solve(D, error)
     return out
 

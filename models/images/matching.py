@@ -14,9 +14,9 @@ fall off like those of a Gaussian field, so of the squares of wrong ones in fall
 with one mean [1]_. How much the first stands out of those after it has an F distribution, and the
 chance of a wrong one that stands out as much follows, for any number of shifts searched. Besides,
 the peak must be found again in several parts of the image, each by itself. Around the right peak
-the reference resembles itself, along ridges and streets: what its own correlation explains is no wrong
-peak, but a place that is half alike counts by how likely it is, :math:`e^{-\rho (\rho - \rho_k) /
-\sigma^2}` with :math:`\sigma` the noise of correlation.
+the reference resembles itself, along ridges and streets: what its own correlation explains is no
+wrong peak, but a place that is half alike counts by how likely it is, :math:`e^{-\rho (\rho -
+\rho_k) / \sigma^2}` with :math:`\sigma` the noise of correlation.
 
 **How far it is off.** Near the peak the shift of the image and a linear map about its center,
 :math:`\theta`, follow from the score of correlation,
@@ -618,13 +618,9 @@ def _allowed(shifts: list[FloatArray], covariance: FloatArray) -> NDArray[np.boo
     return np.asarray(square <= _SIGMAS**2)
 
 
-<<<<<<< HEAD
 def _standing_out(
     surface: Single, allowed: NDArray[np.bool_], drawn: Single, shape: tuple[int, ...]
 ) -> tuple[int, int, float] | None:
-=======
-def _standing_out(surface: Single, allowed: NDArray[np.bool_]) -> tuple[int, int, float] | None:
->>>>>>> fix
     """The highest allowed peak, and the chance that a wrong one stands out as much."""
     where = np.where(allowed, surface, -np.inf)
     i, j = (int(k) for k in np.unravel_index(where.argmax(), where.shape))
