@@ -40,6 +40,8 @@ _STEEP = 0.25
 looked at: slopes between points of an elevation model are up to twice those over two steps."""
 _FEW = 1e-4
 """Share of the samples of terrain that are folded or hidden, below which they do not show."""
+_SOME = 4
+"""Of so many lines one is looked at for folds, before all are."""
 _PLACES = 4
 """Places that share a cell, at most: those farther out are left out."""
 _ROUNDS = 40
@@ -144,8 +146,9 @@ class TerrainGrid:
             self.power_db[rows], steep[rows] = self._power_db(scene, t[rows], *own)
 
         over(batches(n_i), look_up)
-        relief = _Relief(footprint, scene, t, R, self.height) if steep.any() else None
-        self._relief = relief if relief is not None and relief.folded else None
+        self._relief: _Relief | None = None
+        if steep.any() and _Relief(footprint, scene, t[::_SOME], R, self.height).folded:
+            self._relief = _Relief(footprint, scene, t, R, self.height)
         self._i, self._j = self.latitude / scene.cell, self.longitude / scene.cell
         self.cells = tuple(
             range(int(np.floor(a.min())) - 1, int(np.ceil(a.max())) + 2) for a in (self._i, self._j)
@@ -232,8 +235,8 @@ class TerrainGrid:
         """Brightness, and by lines whether there may be layover or shadow on slopes so steep."""
         p = self.footprint.ground.point(latitude, longitude, height)
         cosine, rising = _facing(self.footprint, scene, p, latitude, longitude, t[:, None])
-        steep = ((cosine < _STEEP) | (rising < _STEEP)).any(axis=1)
-        return 10 * np.log10(np.maximum(brightness(cosine), 1e-6)), steep
+        steep = np.any((cosine < _STEEP) | (rising < _STEEP), axis=1)
+        return 10 * np.log10(np.maximum(brightness(cosine), 1e-6)), np.asarray(steep)
 
 
 def _facing(
