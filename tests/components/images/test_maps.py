@@ -17,7 +17,7 @@ from terrafix.cosim.declare.ports import Output  # noqa: E402
 from terrafix.cosim.engine.simulation import Simulation  # noqa: E402
 from terrafix.models.geometry.geodesy import ecef, geodetic  # noqa: E402
 from terrafix.models.images.reference import Reference  # noqa: E402
-from terrafix.models.maps.dem import dem_from, flat_dem  # noqa: E402
+from terrafix.models.maps.dem import dem_from, flat_dem, read_jacksboro  # noqa: E402
 from terrafix.models.maps.geoid import harmonic_undulation  # noqa: E402
 from terrafix.models.motion.arc import OrbitArc, seen_at  # noqa: E402
 from terrafix.models.motion.attitude import lvlh_quaternion_array  # noqa: E402
@@ -175,6 +175,9 @@ def test_its_rows_are_times_and_its_columns_ranges(tmp_path):
     t, R = seen_at(OrbitArc(R_E, V_E, 0.0, 5.0, 5.0), p, doppler, 0.23)
     assert np.ptp(np.diff(R, axis=1)) < 0.02 * np.diff(R, axis=1).mean()
     assert np.ptp(t, axis=1).max() < 2e-4  # 1.4 m; of a beam that is 30 m lower
+    dem = read_jacksboro().tiled()
+    rise = dem.at(part.places[..., 0], part.places[..., 1]) - part.places[..., 2]
+    assert np.quantile(np.abs(rise), 0.99) < 0.1  # but where slopes are laid over
     speed = np.diff(t[:, 0]).mean() / np.diff(part.tie_rows).mean()
     assert 12.0 / speed == pytest.approx(6800, rel=0.02)  # over the ground [m/s]
 
