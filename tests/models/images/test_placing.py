@@ -180,3 +180,15 @@ def test_errors_of_places_are_along_and_across(known):
     _, longitude, height = geodetic(p)
     assert height == pytest.approx(hills(geodetic(p)[0], longitude), abs=0.05)
     assert np.linalg.norm(ecef(*geodetic(p)) - p) < 1e-3
+
+
+@pytest.mark.parametrize(("latitude", "side"), [(79.5, -1), (-79.5, 1), (84.0, 1)])
+def test_high_latitudes_are_as_others(latitude, side):
+    """Eastward at 80 degrees looking to the pole, and at 84: places at 84 to 85, and at 80."""
+    phi = np.radians(latitude)
+    r = 7.07e6 * np.array([0.0, np.cos(phi), np.sin(phi)])
+    view = replace(VIEW, r=r, v=np.array([-7600.0, 0.0, 0.0]), sine=0.0, side=side)
+    ties = reference(view, flat, n=33)
+    assert np.degrees(np.abs(ties.latitude)).max() > 78
+    where = predicted(view, np.zeros((6, 6)), ties, flat, SHAPE)
+    np.testing.assert_allclose(where.at([200.5], [299.9])[0, 0], [800.5, 899.9], atol=0.05)
