@@ -116,6 +116,8 @@ class ImageMatcher(OnReference):
     def _view(self, m: int) -> View:
         """How a member's image was seen, as its estimate has it."""
         image = self.image
+        speed = float(np.linalg.norm(self.prior.v_e[m]))
+        earlier = speed * float(image.sine[m]) / float(image.velocity[m]) ** 2
         return View(
             self.prior.r_e[m],
             self.prior.v_e[m],
@@ -128,6 +130,7 @@ class ImageMatcher(OnReference):
             1 if image.side[m] > 0 else -1,
             float(image.time_sigma[m]),
             float(self.range_sigma[m]),
+            -earlier * float(image.column_range[m]),
         )
 
     def _matched(

@@ -106,7 +106,10 @@ _STIFF = 1e-5
 """Least sigma of a linear map: a thousandth of a pixel in a hundred."""
 _LINEAR = np.ix_([1, 2, 4, 5], [1, 2, 4, 5])
 """Of the six parameters of alignment, those that are a linear map."""
-_ROUNDS, _CLOSE, _STRIDE = 8, 0.01, 1.5
+_LOOSELY = 0.1
+"""What a linear map may move half way to the corners, beyond which blurred images are aligned first
+[pixels]."""
+_ROUNDS, _CLOSE, _STRIDE = 12, 0.01, 1.5
 """Of the alignment, its end, and its longest step [pixels]."""
 _RIM = 3
 """Of the image, where slopes are not known [pixels]."""
@@ -424,7 +427,7 @@ def misplaced(
             found = _standing_out(np.asarray(surface, np.float32), np.ones(surface.shape, np.bool_))
             if found is not None and (best is None or found[2] < best[0]):
                 best = found[2], float(turn), float(growth)
-    if best is None or best[0] > _CHANCE:
+    if best is None or best[0] > _CHANCE or best[1:] == (0.0, 0.0):
         return None
     return best[1], best[2]
 
@@ -657,7 +660,8 @@ def _aligned(
     known[_LINEAR] = np.linalg.inv(unit**2 * (predicted.linear + _STIFF**2 * np.eye(4)))
     off = np.zeros(6)
     off[_LINEAR[0].ravel()] = unit * (peak.turn * _TURN + peak.growth * _GROWTH)
-    for level in ("coarse", "fine") if off.any() else ("fine",):
+    loose = off.any() or unit * np.sqrt(np.diag(predicted.linear).max()) > _LOOSELY
+    for level in ("coarse", "fine") if loose else ("fine",):
         a, b = getattr(image.layers, level), getattr(drawn.layers, level)
         patch = _Patch(a, center, unit)
         for _ in range(_ROUNDS):

@@ -66,6 +66,9 @@ class View:
         To the right of the track, or to the left.
     time_sigma, range_sigma : float
         Standard errors of time [s] and slant range [m].
+    column_time : float
+        From column to column along a row [s]: rows are of zero Doppler, and how long before that
+        the beam's center passes grows with range, by :math:`\lambda f / (2 V^2)` of it.
     """
 
     r: FloatArray
@@ -79,14 +82,16 @@ class View:
     side: int = 1
     time_sigma: float = 0.0
     range_sigma: float = 0.0
+    column_time: float = 0.0
 
     def points(self, rows: FloatArray, columns: FloatArray, height: FloatArray) -> FloatArray:
         """Places (n_rows, n_columns, 3) [m] of pixels at heights (n_rows, n_columns) [m]."""
-        t = ((rows - self.row) * self.row_time)[:, None]
+        down, across = (rows - self.row)[:, None], (columns - self.column)[None, :]
+        t = (down * self.row_time + across * self.column_time)[..., None]
         a = np.asarray(earth_fixed_acceleration_array(self.r, self.v))
         r, v = self.r + self.v * t + a * t * t / 2, self.v + a * t
         R = self.slant_range + (columns - self.column) * self.column_range
-        return ground_point(r[:, None], v[:, None], R, self.sine, height, self.side)
+        return ground_point(r, v, R, self.sine, height, self.side)
 
 
 def predicted(
