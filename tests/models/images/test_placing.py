@@ -195,7 +195,7 @@ def test_high_latitudes_are_as_others(latitude, side):
 
 
 def test_columns_of_a_squinted_image_were_seen_one_after_the_other():
-    """At 7 kHz and 5.6 cm a row is of zero Doppler, and the beam passes 256 columns of 4.64 m 4.7 ms
+    """At 7 kHz and 5.6 cm the beam passes 256 columns of 4.64 m of a row of zero Doppler 4.7 ms
     apart: at the last of them it has flown 35 m further."""
     late = replace(VIEW, column_time=-4.7e-3 / 256)
     ends = np.array([VIEW.column, VIEW.column + 256])
