@@ -415,7 +415,7 @@ def misplaced(
     if drawn is None:
         return None
     a, b = (
-        np.ascontiguousarray(cv2.GaussianBlur(layers.coarse, (0, 0), _LOOSE)[::4, ::4])
+        np.ascontiguousarray(cv2.GaussianBlur(layers.coarse, (0, 0), _LOOSE)[::4, ::4], np.float32)
         for layers in (image.layers, drawn.layers)
     )
     if a.std() < 1e-6 or b.shape[0] < a.shape[0] or b.shape[1] < a.shape[1]:
@@ -549,13 +549,13 @@ def _averaged(amplitude: Single, predicted: Prediction, shape: tuple[int, int]) 
 def _tried(sigma: float, corner: float) -> FloatArray:
     """Turns, or growths, that are tried where corners so far off would be moved too much."""
     n = min(int(np.ceil(_SIGMAS * sigma * corner / _CORNERS - 0.5)), _MOST // 2)
-    return np.arange(-max(n, 0), max(n, 0) + 1) * (_CORNERS / corner)
+    return np.asarray(np.arange(-max(n, 0), max(n, 0) + 1) * (_CORNERS / corner), np.float64)
 
 
 def _linear(turn: float, growth: float) -> FloatArray:
     """Turn and growth of (row, column), shape (2, 2)."""
     c, s = np.cos(turn), np.sin(turn)
-    return (1 + growth) * np.array([[c, -s], [s, c]])
+    return np.asarray((1 + growth) * np.array([[c, -s], [s, c]]), np.float64)
 
 
 def _xy(transform: FloatArray) -> FloatArray:
@@ -682,8 +682,9 @@ def _aligned(
         return None
     warped = _warped(b, transform, a.shape)
     correlation = float(np.corrcoef(a.ravel(), warped.ravel())[0, 1])
-    linear = transform[:, :2]
-    return _Aligned(transform, covariance[np.ix_([0, 3], [0, 3])], correlation, linear)
+    linear = np.asarray(transform[:, :2], np.float64)
+    of_shift = np.asarray(covariance[np.ix_([0, 3], [0, 3])], np.float64)
+    return _Aligned(transform, of_shift, correlation, linear)
 
 
 def _moved(transform: FloatArray, step: FloatArray, center: FloatArray, unit: float) -> FloatArray:
@@ -722,7 +723,7 @@ class _Patch:
 
     def _normalized(self, a: Single) -> tuple[Single, Single]:
         """An image and its slopes down and across (2, ...), of unit power."""
-        slopes = np.stack([g[self._inner] for g in np.gradient(a)])
+        slopes = np.stack([np.gradient(a, axis=k)[self._inner] for k in (0, 1)])
         inner = a[self._inner]
         scale = np.float32(1 / np.sqrt(max(float(np.mean(inner * inner)), 1e-12)))
         return inner * scale, slopes * scale
@@ -764,7 +765,7 @@ def _agreeing(image: Searchable, drawn: _Drawn, transform: FloatArray) -> FloatA
             i, j, n, m = rows[0], columns[0], len(rows), len(columns)
             part = np.ascontiguousarray(image.layers.fine[i : i + n, j : j + m])
             about = np.ascontiguousarray(wide[i : i + n + 2 * _REACH, j : j + m + 2 * _REACH])
-            surface = cv2.matchTemplate(about, part, cv2.TM_CCOEFF)
+            surface = np.asarray(cv2.matchTemplate(about, part, cv2.TM_CCOEFF), np.float32)
             p, q = (int(k) for k in np.unravel_index(surface.argmax(), surface.shape))
             if np.hypot(*(_vertex(surface, p, q) - _REACH)) < _NEAR:
                 found.append([i + (n - 1) / 2, j + (m - 1) / 2])
