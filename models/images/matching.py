@@ -111,7 +111,10 @@ _STIFF = 1e-5
 """Least sigma of a linear map: a thousandth of a pixel in a hundred."""
 _LINEAR = np.ix_([1, 2, 4, 5], [1, 2, 4, 5])
 """Of the six parameters of alignment, those that are a linear map."""
-_ROUNDS, _CLOSE, _STRIDE = 8, 0.01, 1.5
+_LOOSELY = 0.1
+"""What a linear map may move half way to the corners, beyond which blurred images are aligned first
+[pixels]."""
+_ROUNDS, _CLOSE, _STRIDE = 12, 0.01, 1.5
 """Of the alignment, its end, and its longest step [pixels]."""
 _RIM = 3
 """Of the image, where slopes are not known [pixels]."""
@@ -417,7 +420,7 @@ def misplaced(
     if drawn is None:
         return None
     a, b = (
-        np.ascontiguousarray(cv2.GaussianBlur(layers.coarse, (0, 0), _LOOSE)[::4, ::4])
+        np.ascontiguousarray(cv2.GaussianBlur(layers.coarse, (0, 0), _LOOSE)[::4, ::4], np.float32)
         for layers in (image.layers, drawn.layers)
     )
     if a.std() < 1e-6 or b.shape[0] < a.shape[0] or b.shape[1] < a.shape[1]:
@@ -429,7 +432,7 @@ def misplaced(
             found = _standing_out(np.asarray(surface, np.float32), np.ones(surface.shape, np.bool_))
             if found is not None and (best is None or found[2] < best[0]):
                 best = found[2], float(turn), float(growth)
-    if best is None or best[0] > _CHANCE:
+    if best is None or best[0] > _CHANCE or best[1:] == (0.0, 0.0):
         return None
     return best[1], best[2]
 
@@ -551,13 +554,13 @@ def _averaged(amplitude: Single, predicted: Prediction, shape: tuple[int, int]) 
 def _tried(sigma: float, corner: float) -> FloatArray:
     """Turns, or growths, that are tried where corners so far off would be moved too much."""
     n = min(int(np.ceil(_SIGMAS * sigma * corner / _CORNERS - 0.5)), _MOST // 2)
-    return np.arange(-max(n, 0), max(n, 0) + 1) * (_CORNERS / corner)
+    return np.asarray(np.arange(-max(n, 0), max(n, 0) + 1) * (_CORNERS / corner), np.float64)
 
 
 def _linear(turn: float, growth: float) -> FloatArray:
     """Turn and growth of (row, column), shape (2, 2)."""
     c, s = np.cos(turn), np.sin(turn)
-    return (1 + growth) * np.array([[c, -s], [s, c]])
+    return np.asarray((1 + growth) * np.array([[c, -s], [s, c]]), np.float64)
 
 
 def _xy(transform: FloatArray) -> FloatArray:
@@ -689,7 +692,8 @@ def _aligned(
     known[_LINEAR] = np.linalg.inv(unit**2 * (predicted.linear + _STIFF**2 * np.eye(4)))
     off = np.zeros(6)
     off[_LINEAR[0].ravel()] = unit * (peak.turn * _TURN + peak.growth * _GROWTH)
-    for level in ("coarse", "fine") if off.any() else ("fine",):
+    loose = off.any() or unit * np.sqrt(np.diag(predicted.linear).max()) > _LOOSELY
+    for level in ("coarse", "fine") if loose else ("fine",):
         a, b = getattr(image.layers, level), getattr(drawn.layers, level)
         patch = _Patch(a, center, unit)
         for _ in range(_ROUNDS):
@@ -710,8 +714,9 @@ def _aligned(
         return None
     warped = _warped(b, transform, a.shape)
     correlation = float(np.corrcoef(a.ravel(), warped.ravel())[0, 1])
-    linear = transform[:, :2]
-    return _Aligned(transform, covariance[np.ix_([0, 3], [0, 3])], correlation, linear)
+    linear = np.asarray(transform[:, :2], np.float64)
+    of_shift = np.asarray(covariance[np.ix_([0, 3], [0, 3])], np.float64)
+    return _Aligned(transform, of_shift, correlation, linear)
 
 
 def _moved(transform: FloatArray, step: FloatArray, center: FloatArray, unit: float) -> FloatArray:
@@ -750,7 +755,7 @@ class _Patch:
 
     def _normalized(self, a: Single) -> tuple[Single, Single]:
         """An image and its slopes down and across (2, ...), of unit power."""
-        slopes = np.stack([g[self._inner] for g in np.gradient(a)])
+        slopes = np.stack([np.gradient(a, axis=k)[self._inner] for k in (0, 1)])
         inner = a[self._inner]
         scale = np.float32(1 / np.sqrt(max(float(np.mean(inner * inner)), 1e-12)))
         return inner * scale, slopes * scale
@@ -792,7 +797,7 @@ def _agreeing(image: Searchable, drawn: _Drawn, transform: FloatArray) -> FloatA
             i, j, n, m = rows[0], columns[0], len(rows), len(columns)
             part = np.ascontiguousarray(image.layers.fine[i : i + n, j : j + m])
             about = np.ascontiguousarray(wide[i : i + n + 2 * _REACH, j : j + m + 2 * _REACH])
-            surface = cv2.matchTemplate(about, part, cv2.TM_CCOEFF)
+            surface = np.asarray(cv2.matchTemplate(about, part, cv2.TM_CCOEFF), np.float32)
             p, q = (int(k) for k in np.unravel_index(surface.argmax(), surface.shape))
             if np.hypot(*(_vertex(surface, p, q) - _REACH)) < _NEAR:
                 found.append([i + (n - 1) / 2, j + (m - 1) / 2])

@@ -48,7 +48,7 @@ _PIXELS, _RISE = 2.0, 5.0
 
 @dataclass(frozen=True)
 class View:
-    """How an image was seen, as an estimate has it.
+    r"""How an image was seen, as an estimate has it.
 
     Parameters
     ----------
