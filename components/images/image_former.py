@@ -199,6 +199,7 @@ class ImageFormer(Component):
             self.reason[m] = REASONS.index(found.focus.reason)
             values["index"][m] = known[key]
             values["row"][m], values["column"][m] = center
+            values["column_range"][m] = self.range_looks * self._spacing(found.image, m)
             values["focused"][m] = found.focus.accepted
             values["velocity"][m], values["velocity_sigma"][m] = found.velocity, found.sigma
         if not formed.any():
@@ -208,7 +209,6 @@ class ImageFormer(Component):
         speed = np.linalg.norm(self.prior.v_e, axis=1)
         values["sine"] = wavelength * self.acquired.beam_doppler / (2 * speed)
         values["row_time"][:] = self.azimuth_looks / imager.radar.prf
-        values["column_range"][:] = self.range_looks * imager.radar.range_spacing
         values["time_sigma"] = self.acquired.time_sigma
         values["side"] = self.acquired.side
         self.images = np.stack(chips)
@@ -253,6 +253,12 @@ class ImageFormer(Component):
     def _beam(self, m: int) -> tuple[float, float]:
         """Slant range and Doppler frequency of the beam's center."""
         return float(self.acquired.beam_range[m]), float(self.acquired.beam_doppler[m])
+
+    def _spacing(self, image: Image, m: int) -> float:
+        """Slant range of the beam from column to column, which are of closest range [m]."""
+        _, doppler = self._beam(m)
+        near, far = image.seen_at(0.0, np.array([0.0, 1.0]), doppler)[1]
+        return float(far - near)
 
     def _refuse(self, m: int, error: ValueError) -> None:
         """Fail a member for which echo of this size holds no image of the size that is wanted."""

@@ -449,7 +449,6 @@ def _received(
         spectrum *= pulse
         spectrum *= beam[rows] @ share
 
-
     def receive(rows: slice) -> None:
         # ranges other than the middle one move by what their migration differs from its
         part = operations.stretched(total[rows], origin, -stretch[rows])

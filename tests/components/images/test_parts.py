@@ -250,7 +250,10 @@ def forming(monkeypatch, focus, **settings):
         processing=lambda f, *_: f,
         focus=lambda found, *_, **reach: sent.update(reach) or (found[0], focus),
         image=lambda _, V: SimpleNamespace(
-            data=np.ones((400, 400), complex), velocity=V, pixel=lambda *_: (0.0, 0.0)
+            data=np.ones((400, 400), complex),
+            velocity=V,
+            pixel=lambda *_: (0.0, 0.0),
+            seen_at=lambda _, column, f: (f, 861013.0 + 9.4 * column),
         ),
         velocity_at=lambda _, V, *rest: V + 0.25,
     )
@@ -277,7 +280,8 @@ def test_relief_is_part_of_the_velocitys_error(monkeypatch):
     assert sent["slant_range"][0] == 861013.0
     speed = np.linalg.norm(V_E)
     assert sent["sine"][0] == pytest.approx(WAVELENGTH * 54.0 / (2 * speed), rel=1e-12)
-    assert (sent["row_time"][0], sent["column_range"][0]) == (2 / 2160.0, 9.4)
+    assert sent["row_time"][0] == 2 / 2160.0
+    assert sent["column_range"][0] == pytest.approx(9.4, abs=1e-8)
     assert (sent["time_sigma"][0], sent["side"][0]) == (1e-5, 1.0)
 
 
