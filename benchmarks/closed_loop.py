@@ -133,7 +133,6 @@ def outcome(system: System, number: int, members: int) -> dict[str, Any]:
         beam = boresight(r[0], v[0], q_be[0], q_mu[0])
         axes = track_axes(beam.point, v[0])
         found["fix"].append((at("matcher.fix.r_f_e", t) - beam.point) @ axes.T)
-        found["D"].append(axes @ at("matcher.fix.D", t) @ axes.T)
         V = effective_velocity_array(r[0], v[0], beam.point)
         y, present = at("matcher.fix.y", t), at("matcher.fix.present", t)
         found["velocity"].append(np.where(present[:, 3] > 0, y[:, 3] - V, np.nan))

@@ -72,6 +72,7 @@ BASES = {  # of which types are made
         "FilterTruth",
         "InView",
         "NoisyComponent",
+        "OwnOrCommon",
         "OnGround",
         "OnReference",
     ),
