@@ -23,6 +23,7 @@ from terrafix.cosim.declare.ports import (
     SharedInput,
     SharedOutput,
 )
+from terrafix.models.core.parallel import over
 from terrafix.models.geometry.geodesy import geodetic
 from terrafix.models.geometry.geolocation import ground_point
 from terrafix.models.images.matching import (
@@ -91,17 +92,21 @@ class ImageMatcher(OnReference):
             return
         reference, dem = self._covered_reference(), self._dem()
         searchable = Searchable(reference.amplitude)
-        chips: dict[int, Searchable] = {}
+        members = [int(m) for m in np.flatnonzero(fresh)]
+        indices = {m: int(self.image.index[m]) for m in members}
+        chips = {k: Searchable(self.images[k]) for k in sorted(set(indices.values()))}
         n = self.n_members
         places, D = np.zeros((n, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
         valid = np.zeros(n, np.bool_)
-        matches: list[Match] = []
-        for m in map(int, np.flatnonzero(fresh)):
-            index = int(self.image.index[m])
-            if index not in chips:
-                chips[index] = Searchable(self.images[index])
-            view = self._view(m)
-            match = self._matched(m, view, chips[index], searchable, reference, dem)
+        views = {m: self._view(m) for m in members}
+        matches: dict[int, Match] = {}
+
+        def match_one(m: int) -> None:
+            matches[m] = self._matched(m, views[m], chips[indices[m]], searchable, reference, dem)
+
+        over(members, match_one)
+        for m in members:
+            match, view = matches[m], views[m]
             if match.accepted:
                 try:
                     sigma = self.reference_sigma[m]
@@ -112,8 +117,8 @@ class ImageMatcher(OnReference):
             self.reason[m] = REASONS.index(match.reason)
             self.match_sigma[m] = match.sigma.max() if match.accepted else np.nan
             self.match_place[m] = match.row, match.column
-            matches.append(match)
-        self.inliers, self.outline = matches[0].blocks, matches[0].outline
+        first = matches[members[0]]
+        self.inliers, self.outline = first.blocks, first.outline
         if not valid.any():
             self._require_coverage(reference, fresh)
             self._tell_misplaced(int(np.argmax(fresh)), chips, searchable, reference, dem)
