@@ -30,11 +30,10 @@ from terrafix.models.images.matching import (
     REASONS,
     Match,
     Searchable,
-    matched,
     misplaced,
     refused,
 )
-from terrafix.models.images.placing import View, placed, predicted
+from terrafix.models.images.placing import View, placed, predicted, recognized
 from terrafix.models.images.reference import Reference
 from terrafix.models.maps.dem import Dem
 
@@ -154,10 +153,9 @@ class ImageMatcher(OnReference):
         """Match of a member's image, where its estimate predicts it."""
         P = np.asarray(self.prior.P[m])[:6, :6]
         try:
-            where = predicted(view, P, reference, dem.known_at, chip.shape)
+            return recognized(chip, searchable, view, P, reference, dem.known_at)
         except ValueError:
             return refused("what is estimated sees no ground")
-        return matched(chip, searchable, where, (view.row, view.column))
 
     def _tell_misplaced(
         self,

@@ -68,6 +68,7 @@ REASONS = (
     "it lies farther off than the prediction can be",
     "what is estimated sees no ground",
     "its place has no height",
+    "its place on a map does not settle",
 )
 """What became of an image."""
 
@@ -154,6 +155,8 @@ class Prediction:
     linear : ndarray, shape (4, 4)
         Of how far rows and columns of the image are off by its rows and columns from the center:
         of the elements of that matrix (2, 2), first row first [-].
+    slant : bool
+        Whether the reference shows relief as the image does: it is none in `places` then.
     """
 
     rows: FloatArray
@@ -161,6 +164,7 @@ class Prediction:
     places: FloatArray
     covariance: FloatArray
     linear: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
+    slant: bool = True
 
     def __post_init__(self) -> None:
         if self.places.shape != (len(self.rows), len(self.columns), 2):

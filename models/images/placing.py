@@ -29,12 +29,20 @@ from numpy.typing import NDArray
 from terrafix.models.core.arrays import FloatArray
 from terrafix.models.geometry.geodesy import ecef, geodetic
 from terrafix.models.geometry.geolocation import Height, ground_point, track_axes
-from terrafix.models.images.matching import Match, Prediction, searched_span
+from terrafix.models.images.matching import (
+    Match,
+    Prediction,
+    Searchable,
+    matched,
+    refused,
+    searched_span,
+)
 from terrafix.models.images.reference import Reference
 from terrafix.models.motion.arc import earth_fixed_acceleration_array
 
-_SPACING, _MOST_NODES = 32.0, 33
-"""From one predicted pixel to the next, and most along an axis [pixels]."""
+_SPACING, _FINE = (32.0, 33), (4.0, 513)
+"""From one predicted pixel to the next [pixels], and most along an axis; those of a map, which has
+the relief between them."""
 _UNSURE = 5e-4
 """Of a linear map, that tie points of a reference may have wrong: half a pixel in a thousand."""
 _SPAN = 300.0
@@ -42,6 +50,9 @@ _SPAN = 300.0
 _ROUNDS, _CLOSE = 60, 0.05
 _FEWEST, _ROUGH = 24, 0.3
 """Nodes that a parabola is put through, and what it may leave of them (rms) [pixels]."""
+_TRIES, _SETTLED = 6, 0.5
+"""Predictions for a place on a map, and how far off the last may be [pixels]: a place that is a
+pixel off moves relief by some hundredths."""
 _PIXELS, _RISE = 2.0, 5.0
 """Differences for the slopes of a place, by pixels and by height [m]."""
 
@@ -111,32 +122,90 @@ def predicted(
         If what is seen is not on the ground.
     """
     covariance, linear = _uncertainty(view, P, terrain, shape)
-    axes = []
-    for n, variance in zip(shape, np.diag(covariance), strict=True):
-        low, high = searched_span(n, float(np.sqrt(variance)))
-        count = int(np.clip(np.ceil((high - low) / _SPACING) + 1, 2, _MOST_NODES))
-        axes.append(np.linspace(low, high, count))
-    rows, columns = axes
+    spans = [
+        searched_span(n, float(np.sqrt(variance)))
+        for n, variance in zip(shape, np.diag(covariance), strict=True)
+    ]
+    rows, columns, places, inside = _nodes(view, reference, terrain, spans, _SPACING)
+    places, slant = _smooth(places, inside)
+    if not slant:
+        rows, columns, places, _ = _nodes(view, reference, terrain, spans, _FINE)
+    return Prediction(rows, columns, places, covariance, linear, slant)
+
+
+def _nodes(
+    view: View,
+    reference: Reference,
+    terrain: Height,
+    spans: list[tuple[float, float]],
+    spacing: tuple[float, int],
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Rows, columns, their places on the reference, and which are inside it."""
+    rows, columns = (
+        np.linspace(low, high, int(np.clip(np.ceil((high - low) / spacing[0]) + 1, 2, spacing[1])))
+        for low, high in spans
+    )
     latitude, longitude, height = _on_terrain(view, rows, columns, terrain)
     row, column, inside = reference.pixel(latitude, longitude, height)
-    places = _smooth(np.stack([row, column], axis=-1), inside)
-    return Prediction(rows, columns, places, covariance, linear)
+    return rows, columns, np.stack([row, column], axis=-1), inside
 
 
-def _smooth(places: FloatArray, inside: NDArray[np.bool_]) -> FloatArray:
-    """Places (n_i, n_j, 2) as a parabola of their row and column, where they nearly are one.
+def recognized(
+    image: Searchable,
+    amplitude: Searchable,
+    view: View,
+    P: FloatArray,
+    reference: Reference,
+    terrain: Height,
+) -> Match:
+    """Find where an image lies on a reference, from where an estimate predicts it.
+
+    On a map, which is not in slant geometry, what is predicted of relief belongs to the place where
+    the estimate looks. It is predicted anew for the place that is found, until that stays.
+
+    Parameters
+    ----------
+    image, amplitude : Searchable
+        The image, and the reference's.
+    view, P, reference, terrain
+        As of `predicted`.
+
+    Raises
+    ------
+    ValueError
+        If what is seen is not on the ground.
+    """
+    c, own = (view.row, view.column), view
+    for _ in range(_TRIES):
+        where = predicted(own, P, reference, terrain, image.shape)
+        match = matched(image, amplitude, where, c)
+        off = np.array([match.row, match.column]) - where.at([c[0]], [c[1]])[0, 0]
+        if not match.accepted or where.slant or np.abs(off).max() < _SETTLED:
+            return match
+        latitude, longitude, _ = reference.place(match.row, match.column)
+        found = ecef(latitude, longitude, terrain(latitude, longitude))
+        seen = ecef(*(a[0, 0] for a in _on_terrain(own, *(np.array([x]) for x in c), terrain)))
+        if not np.isfinite(found).all():
+            return refused("its place has no height")
+        own = replace(own, r=own.r + found - seen)
+    return refused("its place on a map does not settle")
+
+
+def _smooth(places: FloatArray, inside: NDArray[np.bool_]) -> tuple[FloatArray, bool]:
+    """Places (n_i, n_j, 2) as a parabola of row and column, where they nearly are one; if so.
 
     In slant geometry they are, as two radars see relief nearly alike. What is not smooth comes of
     where the estimate sees it from, wrongly: a tenth of a pixel, of which the center would have
     its own part. Of a map that is not in slant geometry relief is real, and is kept.
     """
     if inside.sum() < _FEWEST:
-        return places
+        return places, True
     i, j = np.meshgrid(*(np.linspace(-1, 1, n) for n in inside.shape), indexing="ij")
     terms = np.stack([np.ones_like(i), i, j, i * i, i * j, j * j], axis=-1)
     fitted = terms @ np.linalg.lstsq(terms[inside], places[inside], rcond=None)[0]
     rough = np.sqrt(np.mean((places - fitted)[inside] ** 2, axis=0))
-    return fitted if rough.max() < _ROUGH else places
+    smooth = bool(rough.max() < _ROUGH)
+    return fitted if smooth else places, smooth
 
 
 def _uncertainty(

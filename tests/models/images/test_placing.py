@@ -7,8 +7,8 @@ import pytest
 
 from terrafix.models.geometry.geodesy import ecef, geodetic
 from terrafix.models.geometry.geolocation import track_axes
-from terrafix.models.images.matching import Match
-from terrafix.models.images.placing import View, placed, predicted
+from terrafix.models.images.matching import Match, Searchable
+from terrafix.models.images.placing import View, _on_terrain, placed, predicted, recognized
 from terrafix.models.images.reference import Reference
 
 SHAPE = (480, 600)
@@ -192,3 +192,61 @@ def test_high_latitudes_are_as_others(latitude, side):
     assert np.degrees(np.abs(ties.latitude)).max() > 78
     where = predicted(view, np.zeros((6, 6)), ties, flat, SHAPE)
     np.testing.assert_allclose(where.at([200.5], [299.9])[0, 0], [800.5, 899.9], atol=0.05)
+
+
+def ridges(latitude, longitude):
+    """120 m of relief each kilometer: slopes of a fourth."""
+    return 60 * (1 + np.sin(latitude * 6371 / 0.25) * np.cos(longitude * 5500 / 0.3))
+
+
+def patterned(latitude, longitude, seed=5):
+    """Amplitude of a ground that shows something everywhere: waves of 40 to 400 m."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros(np.shape(latitude))
+    for _ in range(60):
+        k = 2 * np.pi / np.exp(rng.uniform(np.log(40.0), np.log(400.0)))
+        angle, phase = rng.uniform(0, 2 * np.pi, 2)
+        total += np.cos(
+            k * 6371e3 * (np.cos(angle) * latitude + np.sin(angle) * 0.87 * longitude) + phase
+        )
+    return np.exp(total / np.sqrt(60)).astype(np.float32)
+
+
+def test_an_image_of_relief_is_recognized_on_a_map_that_shows_none():
+    """A map north up, 12 m a pixel, an estimate 1.2 km off, 120 m of relief each kilometer.
+
+    Its relief is predicted node by node, and anew for the place that is found.
+    """
+    shape = (200, 160)
+    view = replace(VIEW, row=99.5, column=79.5, row_time=4 / 2160, column_range=9.37)
+    rows, columns = (np.arange(n, dtype=float) for n in shape)
+    latitude, longitude, _ = _on_terrain(view, rows, columns, ridges)
+    image = Searchable(patterned(latitude, longitude))
+    true = (
+        latitude[99, 79] / 2 + latitude[100, 80] / 2,
+        longitude[99, 79] / 2 + longitude[100, 80] / 2,
+    )
+    step = 12 / 6371e3
+    i, j = np.arange(-300, 301) * step, np.arange(-300, 301) * step / 0.87
+    ties = np.linspace(0, 600, 41)
+    lat, lon = np.meshgrid(true[0] - i, true[1] + j, indexing="ij")
+    at = np.meshgrid(
+        np.interp(ties, np.arange(601), true[0] - i),
+        true[1] + np.interp(ties, np.arange(601), j),
+        indexing="ij",
+    )
+    known = Reference(patterned(lat, lon), ties, ties, *at, ridges(*at))
+    ahead = V_E / np.linalg.norm(V_E)
+    wrong = replace(view, r=R_E + 1200.0 * ahead)
+    P = np.diag([800.0**2] * 3 + [0.1**2] * 3)
+    amplitude = Searchable(known.amplitude)
+    where = predicted(wrong, P, known, ridges, shape)
+    assert not where.slant
+    match = recognized(image, amplitude, wrong, P, known, ridges)
+    assert match.accepted
+    # by nodes of relief as far apart as in slant geometry it is off by 1.6 columns, 19 m
+    np.testing.assert_allclose([match.row, match.column], [300, 300], atol=0.06)
+
+
+def test_in_slant_geometry_nothing_is_predicted_again(known):
+    assert predicted(VIEW, np.diag([1e6] * 3 + [1e2] * 3), known, hills, SHAPE).slant
