@@ -524,24 +524,27 @@ def _drawn(shape: tuple[int, int], reference: Searchable, predicted: Prediction)
     seen = _inside(place, reference.shape)
     if not seen.any():
         return None
-    low = np.floor(place[seen].min(axis=0)).astype(int) - 2
-    high = np.ceil(place[seen].max(axis=0)).astype(int) + 3
+    there = [place[..., k][seen] for k in (0, 1)]
+    low = np.floor([own.min() for own in there]).astype(int) - 2
+    high = np.ceil([own.max() for own in there]).astype(int) + 3
     low = np.maximum(low, 0)
     part = _averaged(reference.amplitude[low[0] : high[0], low[1] : high[1]], predicted, shape)
     nepers, known = _nepers(part)
     x, y = (np.ascontiguousarray(place[..., k] - low[k], np.float32) for k in (1, 0))
     smooth = cv2.GaussianBlur(nepers, (0, 0), _DRAWN)
-    there = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    drawn = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     if not known.all():
         seen &= cv2.remap(known, x, y, cv2.INTER_LINEAR) > 0.5
-    layers = _Layers(np.asarray(there), seen.astype(np.float32), _DRAWN)
+    layers = _Layers(np.asarray(drawn), seen.astype(np.float32), _DRAWN)
     return _Drawn(layers, np.array([float(s[0]) for s in spans]))
 
 
 def _inside(place: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Which places (..., 2) are on an image of a shape."""
-    low, high = place.min(axis=-1) >= 0, (place <= np.array(shape) - 1).all(axis=-1)
-    return np.asarray(low & high, np.bool_)
+    row, column = place[..., 0], place[..., 1]  # reductions over two elements are slow
+    return np.asarray(
+        (row >= 0) & (column >= 0) & (row <= shape[0] - 1) & (column <= shape[1] - 1), np.bool_
+    )
 
 
 def _averaged(amplitude: Single, predicted: Prediction, shape: tuple[int, int]) -> Single:
