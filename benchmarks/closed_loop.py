@@ -213,8 +213,10 @@ def updates(closed: list[dict[str, Any]], opened: list[dict[str, Any]]) -> None:
     for k in range(len(TIMES)):
         rows = []
         for runs in (closed, opened):
-            e = np.concatenate([s["error"][k] for s in runs])
-            P = np.concatenate([s["P"][k] for s in runs])
+            # who went without a fix knows less, and is told above
+            whole = [s["accepted"][: k + 1].all(axis=0) for s in runs]
+            e = np.concatenate([s["error"][k][m] for s, m in zip(runs, whole, strict=True)])
+            P = np.concatenate([s["P"][k][m] for s, m in zip(runs, whole, strict=True)])
             predicted = np.sqrt(np.mean(np.diagonal(P, axis1=1, axis2=2), axis=0))
             rows.append((predicted, np.sqrt(np.mean(e**2, axis=0)), e, P))
         (p, s, e, P), (p0, s0, e0, P0) = rows

@@ -234,7 +234,7 @@ def main(members: int) -> None:
     simulate(with_reference(Kept), members=1)
     verdicts("reference of another place", with_reference(OtherPlace), few)
     try:
-        simulate(with_reference(MisplacedReference), members=few)
+        verdicts("geocoding 10 km off", with_reference(MisplacedReference), few)
     except RunError as error:
         print(f"geocoding 10 km off: {error}")
 
