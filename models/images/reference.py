@@ -28,7 +28,8 @@ from terrafix.models.radar.speckle import ARRAY_SPECKLE, Speckle
 
 _ROUNDS, _CLOSE = 20, 1e-3
 """Of the search for a place's pixel, and how close it comes [pixels]; of heights [m]."""
-_ROUNDS_OF_HEIGHT = 60
+_RISES, _RISE_STEP = (100.0, 500.0), 2.0
+"""Heights below and above those known between tie points at which a place is sought; steps [m]."""
 _FEWEST_TIES, _MOST_TIES = 8, 65
 """Tie points along each axis through which the polynomial of heights is put, at least and most."""
 _NO_POLYNOMIAL = 0.5
@@ -130,7 +131,7 @@ class Reference:
         tells: by meters where they are 60 m apart. What a pixel sees at one height is smooth, so
         its place is taken as a polynomial of row, column and height through all tie points, and
         the height as that of the terrain there. Where tie points are no such polynomial (within
-        0.5 m), or heights do not settle (layover), it is that of `place`.
+        0.5 m) it is that of `place`.
 
         Parameters
         ----------
@@ -142,20 +143,37 @@ class Reference:
         Raises
         ------
         ValueError
-            If the pixel is outside the tie points.
+            If the pixel is outside the tie points, or shows several places (layover).
         """
         latitude, longitude, height = (float(x) for x in self.place(row, column))
-        coefficients = self._by_height
-        if coefficients is not None:
-            h = height
-            for _ in range(_ROUNDS_OF_HEIGHT):
-                terms = self._terms(np.array(row), np.array(column), np.array(h))
-                found = terms @ coefficients
-                rise = float(terrain(found[0], found[1])) - h
-                if abs(rise) < _CLOSE:
-                    return float(found[0]), float(found[1]), h
-                h += 0.7 * rise
-        return latitude, longitude, float(terrain(np.array(latitude), np.array(longitude)))
+        there = float(terrain(np.array(latitude), np.array(longitude)))
+        if self._by_height is None:
+            return latitude, longitude, there
+        for reach in _RISES:
+            h = np.arange(min(height, there) - reach, max(height, there) + reach, _RISE_STEP)
+            above = np.asarray(terrain(*self._seen_at(row, column, h))) - h
+            crossed = np.flatnonzero((above[:-1] >= 0) != (above[1:] >= 0))
+            if len(crossed):
+                break
+        if len(crossed) != 1:
+            raise ValueError(
+                f"{len(crossed)} places of the terrain are seen at row {row:.1f}, column "
+                f"{column:.1f} of a reference, from {h[0]:.0f} to {h[-1]:.0f} m of height"
+            )
+        k = int(crossed[0])
+        low, high = h[k], h[k + 1]
+        while high - low > _CLOSE:
+            middle = (low + high) / 2
+            rise = float(terrain(*self._seen_at(row, column, middle))) - middle
+            low, high = (middle, high) if (rise >= 0) == (above[k] >= 0) else (low, middle)
+        found = self._seen_at(row, column, (low + high) / 2)
+        return float(found[0]), float(found[1]), float((low + high) / 2)
+
+    def _seen_at(self, row: float, column: float, height: ArrayLike) -> FloatArray:
+        """Latitude and longitude (2, ...) [rad] that a pixel sees at heights (...) [m]."""
+        terms = self._terms(np.array(row), np.array(column), np.asarray(height, np.float64))
+        assert self._by_height is not None
+        return np.moveaxis(terms @ self._by_height, -1, 0)
 
     @property
     def tells_heights(self) -> bool:

@@ -250,3 +250,24 @@ def test_an_image_of_relief_is_recognized_on_a_map_that_shows_none():
 
 def test_in_slant_geometry_nothing_is_predicted_again(known):
     assert predicted(VIEW, np.diag([1e6] * 3 + [1e2] * 3), known, hills, SHAPE).slant
+
+
+def test_a_place_on_a_slope_that_nearly_folds_is_on_it_and_one_that_folds_is_refused(known):
+    """Slopes to 0.68 at 39 deg of incidence leave a tenth of the range; at 1.2 it runs backward."""
+
+    def ridge(steep):
+        def height(latitude, longitude):
+            return 150 + 250 * steep * np.sin((longitude + 1.66) * 5.5e6 / 250)
+
+        return height
+
+    rows, columns = np.linspace(600, 700, 8), np.linspace(600, 1100, 60)
+    for row in rows:
+        for column in columns:
+            found = known.place_on(ridge(0.62), row, column)
+            assert ridge(0.62)(*found[:2]) == pytest.approx(found[2], abs=0.02)
+            a, b = np.array([row - 600]), np.array([column - 600])
+            p = VIEW.points(a, b, np.full((1, 1), found[2]))[0, 0]
+            assert np.linalg.norm(ecef(*found) - p) < 0.5
+    with pytest.raises(ValueError, match=r"[35] places of the terrain are seen at row 600\.0"):
+        [known.place_on(ridge(1.2), rows[0], column) for column in columns]
