@@ -131,7 +131,7 @@ class Reference:
         tells: by meters where they are 60 m apart. What a pixel sees at one height is smooth, so
         its place is taken as a polynomial of row, column and height through all tie points, and
         the height as that of the terrain there. Where tie points are no such polynomial (within
-        0.5 m) it is that of `place`.
+        0.5 m), or level, it is that of `place`.
 
         Parameters
         ----------
@@ -147,7 +147,7 @@ class Reference:
         """
         latitude, longitude, height = (float(x) for x in self.place(row, column))
         there = float(terrain(np.array(latitude), np.array(longitude)))
-        if self._by_height is None:
+        if not self.tells_heights:
             return latitude, longitude, there
         for reach in _RISES:
             h = np.arange(min(height, there) - reach, max(height, there) + reach, _RISE_STEP)
