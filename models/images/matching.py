@@ -524,13 +524,12 @@ def _drawn(shape: tuple[int, int], reference: Searchable, predicted: Prediction)
     seen = _inside(place, reference.shape)
     if not seen.any():
         return None
-    there = [place[..., k][seen] for k in (0, 1)]
-    low = np.floor([own.min() for own in there]).astype(int) - 2
-    high = np.ceil([own.max() for own in there]).astype(int) + 3
-    low = np.maximum(low, 0)
-    part = _averaged(reference.amplitude[low[0] : high[0], low[1] : high[1]], predicted, shape)
+    ends = [(float(own.min()), float(own.max())) for own in (place[seen, 0], place[seen, 1])]
+    first = [max(int(np.floor(end[0])) - 2, 0) for end in ends]
+    own = tuple(slice(k, int(np.ceil(end[1])) + 3) for k, end in zip(first, ends, strict=True))
+    part = _averaged(reference.amplitude[own], predicted, shape)
     nepers, known = _nepers(part)
-    x, y = (np.ascontiguousarray(place[..., k] - low[k], np.float32) for k in (1, 0))
+    x, y = (np.ascontiguousarray(place[..., k] - first[k], np.float32) for k in (1, 0))
     smooth = cv2.GaussianBlur(nepers, (0, 0), _DRAWN)
     drawn = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     if not known.all():

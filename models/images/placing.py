@@ -137,7 +137,7 @@ def _nodes(
     view: View,
     reference: Reference,
     terrain: Height,
-    spans: list[tuple[float, float]],
+    spans: list[tuple[int, int]],
     spacing: tuple[float, int],
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Rows, columns, their places on the reference, and which are inside it."""
@@ -184,7 +184,8 @@ def recognized(
             return match
         latitude, longitude, _ = reference.place(match.row, match.column)
         found = ecef(latitude, longitude, terrain(latitude, longitude))
-        seen = ecef(*(a[0, 0] for a in _on_terrain(own, *(np.array([x]) for x in c), terrain)))
+        here = _on_terrain(own, np.array([c[0]]), np.array([c[1]]), terrain)
+        seen = ecef(*(a[0, 0] for a in here))
         if not np.isfinite(found).all():
             return refused("its place has no height")
         own = replace(own, r=own.r + found - seen)
