@@ -41,6 +41,7 @@ from terrafix.models.radar.doppler import centroid_candidates
 from terrafix.models.radar.focusing import Image
 from terrafix.models.radar.imaging import (
     BLIND,
+    FARTHEST,
     OPEN,
     REASONS,
     ZERO,
@@ -54,8 +55,6 @@ from terrafix.models.sensors.effective_velocity import VelocityField, velocity_f
 
 _SIGMAS = 5.0
 """How far from the estimate the velocity is looked for, in standard deviations."""
-_FARTHEST = 300.0
-"""At most [m/s]."""
 _MOST_CENTROIDS = 12
 """That an estimate may leave open: an echo is focused with each."""
 
@@ -230,7 +229,7 @@ class ImageFormer(Component):
         processing, focus = imager.focus(
             [imager.processing(f, field.velocity, field.by_range) for f in centroids],
             field.velocity,
-            reach=min(np.ceil(reach) * imager.migration_step, _FARTHEST),
+            reach=min(np.ceil(reach) * imager.migration_step, FARTHEST),
             velocity_rate=field.by_time,
         )
         if not focus.accepted:

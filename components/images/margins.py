@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from inspect import signature
 from math import hypot
 
 import numpy as np
@@ -24,9 +23,9 @@ from terrafix.cosim.declare.component import Component, FedBy
 from terrafix.models.geometry.frames import earth_fixed_from_inertial_array
 from terrafix.models.maps.dem import flat_dem
 from terrafix.models.motion.attitude import lvlh_quaternion_array
-from terrafix.models.radar.autofocus import autofocus
 from terrafix.models.radar.boresight import Boresight, boresight_on_terrain
 from terrafix.models.radar.chirp import Radar
+from terrafix.models.radar.imaging import FARTHEST
 from terrafix.models.radar.margins import (
     PEAK_OF_IMAGING,
     aperture_lines,
@@ -178,11 +177,10 @@ def foreseen_image(former: Component, fed_by: FedBy) -> Iterator[str]:
 
 
 def _narrow_autofocus(view: View) -> Iterator[str]:
-    band = float(signature(autofocus).parameters["max_change"].default)
     off = SIGMAS * view.velocity_sigma
-    if off > band:
+    if off > FARTHEST:
         yield (
-            f"autofocus looks within {band:g} m/s of the estimate's effective velocity, and "
+            f"autofocus looks within {FARTHEST:g} m/s of the estimate's effective velocity, and "
             f"{SIGMAS:g} sigma of it are {off:.0f} m/s: members that are farther off get no fix of "
             "their velocity"
         )

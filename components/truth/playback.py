@@ -7,7 +7,7 @@ bytes; an orbit file is interpolated, and so is the attitude in a file of radar 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -41,6 +41,25 @@ CLOSE = 1e-9  # [s] within which two times are the same: far below any step, far
 
 _EARTH_RATE = EARTH.rotation_rate
 _UNCOVERED = "the orbit file does not cover this time"
+
+
+def _time_at_start(
+    component: Component, epoch: str | None, since: Callable[[Instant], float]
+) -> float:
+    """Time of a file at t = 0 [s]: `since` its first state at the system's epoch, or `start`."""
+    start = float(component.setting("start"))
+    if epoch is None:
+        return start
+    if start:
+        raise ConfigurationError(
+            f"'{component.name}.start' is {start:g} s, but the run begins at the system's epoch, "
+            f"{epoch}\n  leave one of them"
+        )
+    now = read_epoch(component, epoch)
+    try:
+        return since(now)
+    except (ValueError, ImportError) as error:
+        raise ConfigurationError(f"'{component.name}' cannot be at {epoch}: {error}") from error
 
 
 class Recording:
@@ -293,21 +312,8 @@ class RecordedOrbit(Component):
 
     def _first(self, orbit: Ephemeris | Recording, epoch: str | None) -> float:
         """Time of the file at t = 0 [s]: of the epoch, or `start`."""
-        start = float(self.setting("start"))
-        if epoch is None:
-            return start
-        if start:
-            raise ConfigurationError(
-                f"'{self.name}.start' is {start:g} s, but the run begins at the system's epoch, "
-                f"{epoch}\n  leave one of them"
-            )
-        now = read_epoch(self, epoch)
-        try:
-            if isinstance(orbit, Recording):
-                return orbit.since_start(now)
-            return orbit.since_first(now)
-        except (ValueError, ImportError) as error:
-            raise ConfigurationError(f"'{self.name}' cannot be at {epoch}: {error}") from error
+        since = orbit.since_start if isinstance(orbit, Recording) else orbit.since_first
+        return _time_at_start(self, epoch, since)
 
     def _check_span(self, flown: float) -> None:
         """Look whether the file covers a run of `flown` [s], without a gap and densely enough."""
@@ -543,18 +549,7 @@ class RecordedAttitude(Playback):
 
     def _first(self, body: BodyAttitude, epoch: str | None) -> float:
         """Time of t = 0 since the first state of the orbit [s]."""
-        start = float(self.setting("start"))
-        if epoch is None:
-            return start
-        if start:
-            raise ConfigurationError(
-                f"'{self.name}.start' is {start:g} s, but the run begins at the system's epoch, "
-                f"{epoch}\n  leave one of them"
-            )
-        try:
-            return body.orbit.since_first(read_epoch(self, epoch))
-        except (ValueError, ImportError) as error:
-            raise ConfigurationError(f"'{self.name}' cannot be at {epoch}: {error}") from error
+        return _time_at_start(self, epoch, body.orbit.since_first)
 
     def _attitude(self, body: BodyAttitude, t: float) -> FloatArray:
         try:

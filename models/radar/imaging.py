@@ -26,6 +26,8 @@ ZERO = "no image: the echo is zero"
 REASONS = (*FOCUS_REASONS, BLIND, OPEN, OUTSIDE, ZERO)
 """What became of autofocus; from the first of those above on, there is no image either."""
 
+FARTHEST = 300.0
+"""Farthest from what is believed that a velocity is looked for [m/s]."""
 _SLOPE_STEP = 5e-6
 """Grid of the growth of velocity with range [m/s per m]: 0.02 m/s over half a swath."""
 _RATE_STEP = 2e-3

@@ -109,7 +109,8 @@ ARRAY_SPECKLE = ArraySpeckle()
 
 def c_source() -> str:
     """C of the compiled operations; whoever compiles it defines ``TERRAFIX_KEY``, a string."""
-    return Path(__file__).with_name("speckle.c").read_text()
+    own = Path(__file__).with_name("speckle.c")
+    return own.with_name("turn.c").read_text() + own.read_text()
 
 
 class CompiledSpeckle:

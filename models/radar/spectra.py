@@ -174,7 +174,8 @@ ARRAY_ROWS = ArrayRows()
 
 def c_source() -> str:
     """C of the compiled operations; whoever compiles it defines ``TERRAFIX_KEY``, a string."""
-    return Path(__file__).with_name("spectra.c").read_text()
+    own = Path(__file__).with_name("spectra.c")
+    return own.with_name("turn.c").read_text() + own.read_text()
 
 
 class CompiledRows:

@@ -71,11 +71,17 @@ def test_an_echo_without_room_for_the_image_is_refused():
     assert "former.columns to less" in text
 
 
-def test_a_prior_of_sixty_meters_per_second_is_beyond_autofocus_and_ambiguous():
-    """Doppler: 3 x 2 / lambda x 60 m/s = 1525 Hz, more than half of 2160 Hz, and misalignment."""
+def test_a_prior_of_sixty_meters_per_second_is_ambiguous_and_one_of_110_beyond_autofocus():
+    """Doppler: 3 x 2 / lambda x 60 m/s = 1525 Hz, more than half of 2160 Hz, and misalignment.
+
+    Velocity: 330 m/s times the 1.057 by which the effective one grows with that of the orbit.
+    """
     text = notes(("last_known.velocity_sigma", "60 m/s"))
     assert "3 sigma of the Doppler centroid, 1525 Hz" in text
-    assert re.search(r"3 sigma of it are 1[89]\d m/s", text)
+    assert "autofocus looks" not in text
+    text = notes(("last_known.velocity_sigma", "110 m/s"))
+    found = re.search(r"within 300 m/s .*, and 3 sigma of it are (\d+) m/s", text)
+    assert float(found[1]) == pytest.approx(330 * 1.057, rel=0.02)
 
 
 def test_a_reference_is_asked_to_reach_beyond_the_image():
